@@ -23,12 +23,11 @@ import numpy as np
 
 from fmugym.archive.units import conversion_between
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_integer, check_number
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
-from fmugym.identification.problem import Experiment, Problem, silent
+from fmugym.identification.problem import Experiment, silent
 from fmugym.identification.simulator import median_interval
 from fmugym.logs import Columns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
@@ -86,8 +85,6 @@ def fit_logs(
         ConfigError: If a log, a name, a unit or a range does not fit the task.
         SimulationError: If the FMU fails with the start values or near a tried point.
     """
-    candidates = check_integer("candidates", candidates, 1, 10**6)
-    max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
     with closing(make_env()) as env:
         plant = _Plant(env.unwrapped, dict(columns or {}))
         trajectories = [one for log in logs for one in plant.trajectories(log)]
@@ -103,16 +100,11 @@ def fit_logs(
             plant.env.fmu,
             initial_states=states,
             fixed={n: v for n, v in plant.given.items() if n not in wanted | states},
-            scales={},
-            time_step=None,
-            drop_repeats=False,
-            backend="auto",
-            wash_in=check_number("wash_in", wash_in, 0.0),
+            wash_in=wash_in,
             plant=plant.env.inside.opening,
             advance=advance,
         )
-        with closing(Problem(experiment, wanted, trajectories)) as problem:
-            return fit_of(experiment, problem, max_evaluations, candidates)
+        return fit_of(experiment, wanted, trajectories, max_evaluations, candidates)
 
 
 def write_rows(

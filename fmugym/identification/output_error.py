@@ -303,13 +303,10 @@ def fit_parameters(
         time_step,
         check_flag("drop_repeats", drop_repeats),
         check_text("backend", backend),
-        None if wash_in is None else check_number("wash_in", wash_in, 0.0),
+        wash_in,
     )
-    max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
     fit_states = check_flag("fit_initial_states", fit_initial_states)
-    candidates = check_integer("candidates", candidates, 1, 10**6)
-    with closing(Problem(experiment, wanted, trajectories, fit_states)) as problem:
-        return fit_of(experiment, problem, max_evaluations, candidates)
+    return fit_of(experiment, wanted, trajectories, max_evaluations, candidates, fit_states)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
@@ -317,20 +314,28 @@ def _mapping(what: str, value: Any) -> dict[Any, Any]:
 
 
 def fit_of(
-    experiment: Experiment, problem: Problem, max_evaluations: int, candidates: int
+    experiment: Experiment,
+    parameters: Mapping[str, Limits],
+    trajectories: Sequence[Trajectory],
+    max_evaluations: int,
+    candidates: int,
+    fit_states: bool = True,
 ) -> FitResult:
-    """Solve a problem and collect the results."""
-    solution, costs = problem.solve(max_evaluations, candidates)
-    return FitResult(
-        values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
-        **problem.uncertainty(solution)._asdict(),
-        costs=tuple(costs),
-        bounds=problem.bounds,
-        comparison=problem.compare(solution.x),
-        converged=solution.status > 0,
-        message=solution.message,
-        experiment=experiment,
-    )
+    """Fit with these settings; see ``fit_parameters``."""
+    max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
+    candidates = check_integer("candidates", candidates, 1, 10**6)
+    with closing(Problem(experiment, parameters, trajectories, fit_states)) as problem:
+        solution, costs = problem.solve(max_evaluations, candidates)
+        return FitResult(
+            values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
+            **problem.uncertainty(solution)._asdict(),
+            costs=tuple(costs),
+            bounds=problem.bounds,
+            comparison=problem.compare(solution.x),
+            converged=solution.status > 0,
+            message=solution.message,
+            experiment=experiment,
+        )
 
 
 def _shifted(trajectory: Trajectory, offsets: Mapping[str, float]) -> Trajectory:

@@ -10,14 +10,14 @@ number of trajectories.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number, check_text, float_or_nan
+from fmugym.checks import check_number, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
@@ -25,10 +25,9 @@ from fmugym.identification.simulator import Simulator
 from fmugym.identification.statistics import (
     ROUNDING,
     Correlation,
-    information_inverse,
-    information_of,
     memory_of,
     newey_west,
+    sandwich,
 )
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
@@ -72,10 +71,10 @@ class Experiment:
     fmu: FMU
     initial_states: Mapping[str, str | float]
     fixed: Mapping[str, float | str]
-    scales: Mapping[str, float]
-    time_step: float | None
-    drop_repeats: bool
-    backend: str
+    scales: Mapping[str, float] = field(default_factory=dict)
+    time_step: float | None = None
+    drop_repeats: bool = False
+    backend: str = "auto"
     wash_in: float | None = None
     plant: PoolOpening | None = None
     advance: Callable[[float], None] = silent
@@ -183,15 +182,14 @@ class Problem:
         self._last = np.empty(0), self._states
 
     def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
-        fitted, states = variables[: len(parameters)], variables[len(parameters) :]
-        limits = [_limits(v, parameters[v.name]) for v in fitted]
-        self.bounds = {v.name: x[1:] for v, x in zip(fitted, limits, strict=True)}
-        self.start = np.array([x[0] for x in limits])
-        self._high = np.array([x[2] for x in limits] + [v.maximum for v in states])
-        self._low = np.array([x[1] for x in limits] + [v.minimum for v in states])
-        sizes = [max(abs(x[0]), v.nominal or 0.0) for v, x in zip(fitted, limits, strict=True)]
-        sizes += [v.nominal or 0.0 for v in states]
-        self._differences = DIFFERENCE * np.array([size or 1.0 for size in sizes])
+        count = len(parameters)
+        limits = [_limits(v, parameters[v.name]) for v in variables[:count]]
+        self.bounds = {name: one[1:] for name, one in zip(parameters, limits, strict=True)}
+        limits += [(0.0, v.minimum, v.maximum) for v in variables[count:]]
+        starts, self._low, self._high = np.reshape(limits, (-1, 3)).T
+        self.start = starts[:count]
+        sizes = np.maximum(np.abs(starts), [v.nominal or 0.0 for v in variables])
+        self._differences = DIFFERENCE * np.where(sizes > 0.0, sizes, 1.0)
 
     def close(self) -> None:
         """Free the simulator."""
@@ -266,8 +264,7 @@ class Problem:
         for first in range(0, points.shape[1], self._simulator.num_sets):
             part = points[:, first : first + self._simulator.num_sets]
             values = np.concatenate([self._join(one, self._states) for one in part.T], axis=1)
-            errors = [self._errors(s, w) for w, s in enumerate(self._simulate(values))]
-            costs.append(sum((e**2).sum(axis=1) for e in errors))
+            costs.append(sum((e**2).sum(axis=1) for e in self._errors(values)))
         found = np.concatenate(costs)
         return np.where(np.isfinite(found), found, np.inf)
 
@@ -317,7 +314,6 @@ class Problem:
 
         Residuals that are no white noise count as correlated (Newey and West).
         """
-        inverse, undetermined = information_inverse(solution.jac)
         freedom = max(1, len(solution.fun) - len(self.start) - self._num_states)
         correlations = self._correlations(solution)
         noise = np.mean(self._series(solution.fun) ** 2, axis=0) * len(solution.fun) / freedom
@@ -326,11 +322,7 @@ class Problem:
         scores = weighed.T @ weighed
         if not all(one.is_noise for one in correlations.values()):
             scores, freedom = self._correlated(solution, correlations)
-        covariance = inverse @ scores @ inverse
-        unknown = np.flatnonzero(undetermined)
-        covariance[unknown, unknown] = np.inf
-        information = information_of(solution.jac, scores)
-        return Uncertainty(covariance, information, freedom, correlations)
+        return Uncertainty(*sandwich(solution.jac, scores), freedom, correlations)
 
     def _correlations(self, solution: Any) -> dict[str, Correlation]:
         parts = self._by_trajectory(self._series(solution.fun))
@@ -400,20 +392,25 @@ class Problem:
         values = np.repeat(base, 1 + len(rows), axis=1)
         for index, row in enumerate(rows):
             values[row, 1 + index] += steps[row]
-        errors = [self._errors(s, w) for w, s in enumerate(self._simulate(values))]
-        return [_Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w]) for w, e in enumerate(errors)]
+        return [
+            _Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w])
+            for w, e in enumerate(self._errors(values))
+        ]
 
     def _join(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
         """Return the values for one simulation of each trajectory, shape (names, 1, W)."""
         shared = np.tile(parameters[:, np.newaxis], len(self.trajectories))
         return np.concatenate([shared, states])[:, np.newaxis]
 
-    def _errors(self, simulated: FloatArray, index: int) -> FloatArray:
-        """Return one trajectory's scaled residuals, shape (sets, n * outputs)."""
-        outputs = self.trajectories[index].outputs
-        measured = np.stack([outputs[name] for name in self._simulator.outputs], axis=1)
-        scaled: FloatArray = ((simulated - measured) / self._scales)[:, self._counted[index]]
-        return scaled.reshape(len(scaled), -1)
+    def _errors(self, values: FloatArray) -> list[FloatArray]:
+        """Simulate, and return each trajectory's scaled residuals, shape (sets, n * outputs)."""
+        found = []
+        parts = zip(self.trajectories, self._simulate(values), self._counted, strict=True)
+        for one, simulated, counted in parts:
+            measured = np.stack([one.outputs[n] for n in self._simulator.outputs], axis=1)
+            scaled = ((simulated - measured) / self._scales)[:, counted]
+            found.append(scaled.reshape(len(scaled), -1))
+        return found
 
 
 def _levenberg_marquardt(
@@ -472,7 +469,7 @@ def _start_between(variable: Variable, low: float, high: float) -> float:
 def _counted(trajectory: Trajectory, wash_in: float | None) -> MaskArray:
     """Which samples of a trajectory count: those after the wash-in."""
     since = trajectory.time - trajectory.time[0]
-    counted = since > (-1.0 if wash_in is None else wash_in)
+    counted = since > (-1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0))
     if not counted.any():
         raise ConfigError(
             f"a log of {since[-1]:g} s has no samples after a wash-in of {wash_in:g} s"
@@ -487,7 +484,6 @@ def _measured_states(
     states = np.empty((len(initial_states), len(trajectories)))
     for k, (name, source) in enumerate(initial_states.items()):
         if isinstance(source, str):
-            source = check_text("initial_states", source)
             if source not in trajectories[0].outputs:
                 raise unknown_name("measured output", source, trajectories[0].outputs)
             states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
@@ -501,7 +497,7 @@ def _scales(
 ) -> FloatArray:
     """Return the scale of each output, shape (outputs,)."""
     for name, scale in given.items():
-        if check_text("scales", name) not in outputs:
+        if name not in outputs:
             raise unknown_name("measured output", name, outputs)
         check_number(f"the scale of {name!r}", scale, positive=True)
     spread = {

@@ -8,16 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fmugym.extras import imported
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray
 
-__all__ = [
-    "Correlation",
-    "Inverse",
-    "information_inverse",
-    "information_of",
-    "memory_of",
-    "newey_west",
-]
+__all__ = ["Correlation", "memory_of", "newey_west", "sandwich"]
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
@@ -32,49 +25,29 @@ MOST_LAGS = 20
 """Of the autocorrelations that the test for white noise looks at."""
 
 
-class Inverse(NamedTuple):
-    """The inverse of an information matrix.
+def sandwich(jacobian: FloatArray, scores: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance of an estimate, and the information: its inverse; shapes (k, k).
 
-    Attributes:
-        matrix: The (pseudo-)inverse of J' J, shape (k, k).
-        undetermined: Whether the data leave each parameter undetermined, shape (k,).
-    """
-
-    matrix: FloatArray
-    undetermined: MaskArray
-
-
-def information_inverse(jacobian: FloatArray) -> Inverse:
-    """Invert J' J by a singular value decomposition of J with columns scaled to length one.
+    A singular value decomposition of J with columns scaled to length one shows the directions of
+    which the data tell nothing. The information is 0 along them, and the variance of a parameter
+    that changes along them is infinite.
 
     Args:
-        jacobian: The derivatives of the residuals, shape (n, k).
+        jacobian: The derivatives J of the residuals r, shape (n, k).
+        scores: The covariance of J' r, shape (k, k).
     """
     lengths = np.linalg.norm(jacobian, axis=0)
     safe = np.where(lengths > 0, lengths, 1.0)
     _, values, rows = np.linalg.svd(jacobian / safe, full_matrices=False)
     kept = values > RANK_TOLERANCE * values.max(initial=0.0)
-    root = rows[kept] / values[kept, np.newaxis] / safe
-    undetermined = (np.abs(rows[~kept]) > 1e-6).any(axis=0) | (lengths == 0)
-    return Inverse(root.T @ root, undetermined)
-
-
-def information_of(jacobian: FloatArray, scores: FloatArray) -> FloatArray:
-    """Say how much the data tell of the parameters, along every direction; shape (k, k).
-
-    It is the inverse of the covariance of the estimate, and 0 along the directions of which the
-    data tell nothing.
-
-    Args:
-        jacobian: The derivatives of the residuals, shape (n, k).
-        scores: The covariance of J' r, shape (k, k).
-    """
-    lengths = np.linalg.norm(jacobian, axis=0)
-    safe = np.where(lengths > 0, lengths, 1.0)
-    slopes = jacobian / safe
-    bread = slopes.T @ slopes
-    middle = np.linalg.pinv(scores / np.outer(safe, safe), RANK_TOLERANCE, hermitian=True)
-    return np.asarray(bread @ middle @ bread * np.outer(safe, safe))
+    told, bread = rows[kept], values[kept, np.newaxis] ** 2
+    middle = (told / safe) @ scores @ (told / safe).T
+    narrow, wide = told / bread / safe, told * bread * safe
+    covariance = narrow.T @ middle @ narrow
+    unknown = np.flatnonzero((np.abs(rows[~kept]) > 1e-6).any(axis=0) | (lengths == 0))
+    covariance[unknown, unknown] = np.inf
+    information = wide.T @ np.linalg.pinv(middle, RANK_TOLERANCE, hermitian=True) @ wide
+    return covariance, information
 
 
 class Correlation(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_mapping, check_number
+from fmugym.checks import check_mapping, check_number, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
@@ -47,8 +47,7 @@ class Trajectory:
         outputs = _signals("outputs", self.outputs, len(time))
         if not outputs:
             raise ConfigError("a trajectory needs at least one measured output")
-        if not isinstance(self.label, str):
-            raise ConfigError(f"label must be a text, not {shown(self.label)}")
+        check_text("label", self.label)
         inputs = _signals("inputs", self.inputs, len(time))
         for key, value in (("time", time), ("outputs", outputs), ("inputs", inputs)):
             object.__setattr__(self, key, value)
@@ -136,11 +135,9 @@ def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[st
     Raises:
         ConfigError: If something is not a trajectory, there is none, or the names differ.
     """
-    if not isinstance(trajectories, Sequence):
+    is_list = isinstance(trajectories, Sequence)
+    if not (is_list and all(isinstance(one, Trajectory) for one in trajectories)):
         raise ConfigError(f"expected a list of trajectories, not {shown(trajectories)}")
-    for other in trajectories:
-        if not isinstance(other, Trajectory):
-            raise ConfigError(f"expected a Trajectory, not {shown(other)}")
     if not trajectories:
         raise ConfigError("expected at least one trajectory")
     outputs, inputs = list(trajectories[0].outputs), list(trajectories[0].inputs)
@@ -152,9 +149,6 @@ def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[st
 
 def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:
     checked = check_mapping(f"{what} of a trajectory", signals)
-    for name in checked:
-        if not isinstance(name, str):
-            raise ConfigError(f"{what} of a trajectory: {shown(name)} is not a name")
     return {name: _samples(name, values, count) for name, values in checked.items()}
 
 

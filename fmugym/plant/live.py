@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,18 +18,6 @@ from fmugym.pool.base import FloatArray
 __all__ = ["Live", "forecasts", "horizon"]
 
 _JUST = 1e-6
-
-
-class _Rows(NamedTuple):
-    """Values from now on.
-
-    Attributes:
-        times: In seconds of the year, the first is now.
-        values: In the unit of the data.
-    """
-
-    times: FloatArray
-    values: FloatArray
 
 
 class Live:
@@ -98,15 +86,16 @@ class Live:
             except ConfigError as error:
                 faults[DATA + name] = str(error)
             else:
-                self._write(name, rows)
+                self._write(name, *rows)
         return faults
 
     def _rows(
         self, name: str, entry: Entry, now: float, tags: dict[str, tuple[float, ...]]
-    ) -> _Rows:
+    ) -> tuple[FloatArray, FloatArray]:
+        """Times from now on, in seconds of the year, and the values in the unit of the data."""
         if "file" not in entry.value:
             values = np.array(tags[DATA + name])
-            return _Rows(now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values)
+            return now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values
         times, values = read_rows(entry)
         unit = conversion_between(entry.value.get("unit"), self._own[name], self._units)
         values = values * unit.factor + unit.offset
@@ -120,15 +109,14 @@ class Live:
             )
         first = np.searchsorted(times, now + _JUST, side="right")
         present = values[first - 1] if holds else np.interp(now, times, values)
-        return _Rows(np.append(now, times[first:]), np.append(present, values[first:]))
+        return np.append(now, times[first:]), np.append(present, values[first:])
 
-    def _write(self, name: str, rows: _Rows) -> None:
+    def _write(self, name: str, times: FloatArray, values: FloatArray) -> None:
         past = self._past[name]
-        if not past or past[-1][0] < rows.times[0]:
-            past.append((float(rows.times[0]), float(rows.values[0])))
+        if not past or past[-1][0] < times[0]:
+            past.append((float(times[0]), float(values[0])))
         before = np.array(past)[:-1].reshape(-1, 2).T
-        times = np.append(before[0], rows.times)
-        values = np.append(before[1], rows.values)
+        times, values = np.append(before[0], times), np.append(before[1], values)
         for env in self.envs:
             lookup = None if env.inside.future is None else env.inside.future.lookups.get(name)
             if lookup is not None:

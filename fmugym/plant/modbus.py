@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
@@ -17,7 +17,7 @@ from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError
 from fmugym.plant.tags import Plant, Tag
 
-__all__ = ["ModbusClient", "serve_modbus"]
+__all__ = ["ModbusClient", "Values", "serve_modbus"]
 
 _PORT: Final = 502
 """That of Modbus TCP, where an address has none."""
@@ -28,28 +28,31 @@ _MOST: Final = 120
 _CODES: Final = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 """The functions that read, by what they read."""
 
+_BITS: Final = ("coil", "discrete")
+
 Values = Callable[[], Mapping[str, Sequence[float]]]
 
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
 
 
 class _Place(NamedTuple):
-    """Registers or bits of a device, from the first one to before the last one."""
+    """Where a tag is: registers or bits of a device, from the first one to before the end."""
 
     unit_id: int
     kind: str
     begin: int
     end: int
+    tag: Tag
 
     @property
     def is_bits(self) -> bool:
-        return self.kind in ("coil", "discrete")
+        return self.kind in _BITS
 
     @classmethod
     def of(cls, plant: Plant, tag: Tag) -> _Place:
         where = tag.address
         unit_id = plant["unit_id"] if where.get("unit_id") is None else where["unit_id"]
-        one = cls(unit_id, where["kind"], where["register"], where["register"] + tag.count)
+        one = cls(unit_id, where["kind"], where["register"], 0, tag)
         width = 1 if one.is_bits else _type(tag).value[1]
         return one._replace(end=one.begin + tag.count * width)
 
@@ -63,17 +66,19 @@ def _type(tag: Tag) -> Any:
     return _registers().DATATYPE[tag.address["type"].upper()]
 
 
-def _answer(tag: Tag, place: _Place, cells: Sequence[Any]) -> Answer:
+def _answer(place: _Place, cells: Sequence[Any]) -> Answer:
     """The numbers in registers or bits; devices write NaN for what they do not know."""
     found: Any = cells
+    tag = place.tag
     if not place.is_bits:
         order = tag.address["word_order"]
         found = _registers().convert_from_registers(cells, _type(tag), order)
     return Answer.of(tag, f"{place.kind} {place.begin}", [*np.ravel(found)])
 
 
-def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
+def _cells(place: _Place, values: Sequence[float]) -> Sequence[int]:
     """The registers, or the bits, of values."""
+    tag = place.tag
     numbers = [tag.conversion.inverse(value) for value in values]
     if place.is_bits:
         return [int(number > 0.5) for number in numbers]
@@ -93,23 +98,18 @@ def _saturated(number: float, kind: str) -> int:
     return min(max(round(number), int(limits.min)), int(limits.max))
 
 
-class _Placed(NamedTuple):
-    place: _Place
-    tag: Tag
+def _places(plant: Plant) -> list[_Place]:
+    """Those of all tags, in their order."""
+    found = [_Place.of(plant, tag) for tag in plant.tags.values()]
+    return sorted(found, key=lambda one: one[:4])
 
 
-def _placed(plant: Plant) -> list[_Placed]:
-    """All tags, in the order of their places."""
-    found = [_Placed(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
-    return sorted(found, key=lambda one: one.place)
-
-
-def _neighbours(placed: Sequence[_Placed]) -> list[list[_Placed]]:
-    """The tags that are read at once, since they follow each other without a gap."""
-    found: list[list[_Placed]] = []
-    for one in placed:
-        last = found[-1][-1].place if found else None
-        if last is not None and (*last[:2], last.end) == one.place[:3]:
+def _neighbours(places: Sequence[_Place]) -> list[list[_Place]]:
+    """The places that are read at once, since they follow each other without a gap."""
+    found: list[list[_Place]] = []
+    for one in places:
+        last = found[-1][-1] if found else None
+        if last is not None and (*last[:2], last.end) == one[:3]:
             found[-1].append(one)
         else:
             found.append([one])
@@ -125,15 +125,20 @@ class ModbusClient:
         self._codes = imported("pymodbus.constants", "plant").ExcCodes
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
-        self._blocks = _neighbours(_placed(plant))
-        self._client: Any = None
+        self._blocks = _neighbours(_places(plant))
+        self._client: Any
 
-    async def connect(self) -> None:
+    @asynccontextmanager
+    async def connected(self) -> AsyncIterator[None]:
         """See ``polling.Client``."""
         options = {"timeout": self._timeout, "retries": 0, "reconnect_delay": 0}
         self._client = self._client_of(self._host, port=self._port, **options)
-        if not await self._client.connect():
-            raise LostError("it refuses the connection, or does not answer")
+        try:
+            if not await self._client.connect():
+                raise LostError("it refuses the connection, or does not answer")
+            yield
+        finally:
+            self._client.close()
 
     async def read(self) -> dict[str, Answer]:
         """See ``polling.Client``."""
@@ -142,13 +147,13 @@ class ModbusClient:
             found |= await self._read(block)
         return found
 
-    async def _read(self, block: Sequence[_Placed]) -> dict[str, Answer]:
-        begin, whole = block[0].place.begin, block[0].place._replace(end=block[-1].place.end)
+    async def _read(self, block: Sequence[_Place]) -> dict[str, Answer]:
+        begin, whole = block[0].begin, block[0]._replace(end=block[-1].end)
         cells, fault = await self._ask(whole)
         if not fault:
             return {
-                tag.name: _answer(tag, place, cells[place.begin - begin : place.end - begin])
-                for place, tag in block
+                one.tag.name: _answer(one, cells[one.begin - begin : one.end - begin])
+                for one in block
             }
         if len(block) == 1:
             return {block[0].tag.name: Answer((), fault)}
@@ -184,11 +189,6 @@ class ModbusClient:
             cells += told.bits[:count] if place.is_bits else told.registers
         return cells, ""
 
-    async def close(self) -> None:
-        """See ``polling.Client``."""
-        if self._client is not None:
-            self._client.close()
-
 
 def _host_and_port(address: str) -> tuple[str, int]:
     """The two parts of an address.
@@ -203,35 +203,35 @@ def _host_and_port(address: str) -> tuple[str, int]:
     raise ConfigError(f"expected an address such as '10.0.0.5:{_PORT}', got {shown(address)}")
 
 
-async def serve_modbus(
-    plant: Plant, port: int, values: Values, bound: Callable[[str], None]
-) -> Callable[[], Awaitable[None]]:
+@asynccontextmanager
+async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback.
 
     Args:
         plant: Has the tags.
         port: The port; 0 for a free one.
         values: Returns the values of now, by the names of tags.
-        bound: Is told the address.
 
-    Returns:
-        What ends it.
+    Yields:
+        The address.
     """
     server_of = imported("pymodbus.server", "plant").ModbusTcpServer
-    placed = _placed(plant)
-    for (place, tag), (after, other) in pairwise(placed):
-        if place[:2] == after[:2] and after.begin < place.end:
-            raise other.entry.error(f"it shares {place.kind} {after.begin} with {tag.name!r}")
-    units = groupby(placed, key=lambda one: one.place.unit_id)
+    places = _places(plant)
+    for one, after in pairwise(places):
+        if one[:2] == after[:2] and after.begin < one.end:
+            text = f"it shares {one.kind} {after.begin} with {one.tag.name!r}"
+            raise after.tag.entry.error(text)
+    units = groupby(places, key=lambda one: one.unit_id)
     devices = [_device(unit_id, [*own], values) for unit_id, own in units]
     server = server_of(devices, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
-    bound(f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}")
-    ended: Callable[[], Awaitable[None]] = server.shutdown
-    return ended
+    try:
+        yield f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}"
+    finally:
+        await server.shutdown()
 
 
-def _device(unit_id: int, placed: Sequence[_Placed], values: Values) -> Any:
+def _device(unit_id: int, places: Sequence[_Place], values: Values) -> Any:
     """A device whose registers are written anew before each reading."""
     simulator = imported("pymodbus.simulator", "plant")
     refused = imported("pymodbus.constants", "plant").ExcCodes.ILLEGAL_FUNCTION
@@ -242,12 +242,12 @@ def _device(unit_id: int, placed: Sequence[_Placed], values: Values) -> Any:
         if written is not None:
             return refused
         now = values()
-        for place, tag in placed:
-            if _CODES[place.kind] == code:
-                _put(registers, start, place, _cells(tag, place, now[tag.name]))
+        for one in places:
+            if _CODES[one.kind] == code:
+                _put(registers, start, one, _cells(one, now[one.tag.name]))
         return None
 
-    areas = tuple([_area(simulator, kind, placed)] for kind in _CODES)
+    areas = tuple([_area(simulator, kind, places)] for kind in _CODES)
     return simulator.SimDevice(unit_id, areas, action=look)
 
 
@@ -260,11 +260,11 @@ def _put(registers: list[int], start: int, place: _Place, cells: Sequence[int]) 
         registers[word] = registers[word] | mask if bit else registers[word] & ~mask
 
 
-def _area(simulator: Any, kind: str, placed: Sequence[_Placed]) -> Any:
+def _area(simulator: Any, kind: str, places: Sequence[_Place]) -> Any:
     """What the library needs to know of the registers of a kind, or of the bits."""
-    own = [place for place, _ in placed if place.kind == kind] or [_Place(0, kind, 0, 1)]
-    begin, end = min(one.begin for one in own), max(one.end for one in own)
-    if own[0].is_bits:
+    own = [one for one in places if one.kind == kind]
+    begin, end = min((one.begin for one in own), default=0), max([1, *(one.end for one in own)])
+    if kind in _BITS:
         bits = [False] * (-(-end // 16) * 16)
         return simulator.SimData(0, values=bits, datatype=simulator.DataType.BITS)
     form = simulator.DataType.REGISTERS

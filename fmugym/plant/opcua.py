@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +14,7 @@ from typing import Any, Final
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
+from fmugym.plant.modbus import Values
 from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
@@ -34,19 +36,28 @@ class OpcUaClient:
         self._plant, self._tags = plant, list(plant.tags.values())
         self._address = plant.address if "://" in plant.address else f"opc.tcp://{plant.address}"
         with plant.entry.placing():
-            self._user = credentials(plant.get("credentials"))
+            self._user = credentials(plant["credentials"])
             self._keys = _keys_of(plant)
             if self._user is not None and self._keys is None:
                 raise ConfigError("without encryption, everybody on the line reads the password")
         self._nodes = [_node_id(self._ua, tag) for tag in self._tags]
-        self._client: Any = None
+        self._client: Any
 
-    async def connect(self) -> None:
+    @asynccontextmanager
+    async def connected(self) -> AsyncIterator[None]:
         """See ``polling.Client``."""
         self._client = self._client_of.Client(self._address, timeout=self._plant["timeout"])
         if self._user is not None:
             self._client.set_user(self._user[0])
             self._client.set_password(self._user[1])
+        try:
+            await self._connect()
+            yield
+        finally:
+            with Ignoring(Exception):  # there may be nobody to say goodbye to
+                await self._client.disconnect()
+
+    async def _connect(self) -> None:
         try:
             if self._keys is not None:
                 await self._secure(*self._keys)
@@ -64,7 +75,7 @@ class OpcUaClient:
         policies = imported("asyncua.crypto.security_policies", "plant")
         own = await _certificate_in(certificate)
         self._client.application_uri = _uri_in(own) or self._client.application_uri
-        pinned = self._plant.get("server_certificate")
+        pinned = self._plant["server_certificate"]
         if pinned is not None:
             text = f"its certificate is not that of {shown(pinned)}"
             self._client.certificate_validator = await _only(pinned, partial(RefusedError, text))
@@ -94,13 +105,6 @@ class OpcUaClient:
             return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
         return Answer.of(tag, f"node {node}", numbers)
 
-    async def close(self) -> None:
-        """See ``polling.Client``."""
-        if self._client is not None:
-            client, self._client = self._client, None
-            with Ignoring(Exception):  # there may be nobody to say goodbye to
-                await client.disconnect()
-
 
 def _node_id(ua: Any, tag: Tag) -> Any:
     try:
@@ -116,7 +120,7 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
     """The certificate and the key of the client; None if nothing is encrypted."""
     if not plant["encryption"]:
         return None
-    paths = [plant.get("certificate"), plant.get("key")]
+    paths = [plant["certificate"], plant["key"]]
     if None in paths:
         raise ConfigError(
             "OPC UA is encrypted: give this client's 'certificate' and 'key', or say "
@@ -165,12 +169,8 @@ def _uri_in(certificate: Any) -> str:
 # The server.
 
 
-async def serve_opcua(
-    plant: Plant,
-    port: int,
-    values: Callable[[], Mapping[str, Sequence[float]]],
-    bound: Callable[[str], None],
-) -> Callable[[], Awaitable[None]]:
+@asynccontextmanager
+async def serve_opcua(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback; see ``modbus.serve_modbus``.
 
     Where the plant encrypts, the server makes a certificate of its own, and takes all clients.
@@ -182,13 +182,11 @@ async def serve_opcua(
     server.set_endpoint(f"opc.tcp://127.0.0.1:{port}")
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     if plant["encryption"]:
-        await _certify(server, ua, plant.get("certificate"))
+        await _certify(server, ua, plant["certificate"])
     for tag in plant.tags.values():
         await _add(server, ua, tag, values)
-    await server.start()
-    bound(f"opc.tcp://127.0.0.1:{server.bserver.port}")
-    ended: Callable[[], Awaitable[None]] = server.stop
-    return ended
+    async with server:
+        yield f"opc.tcp://127.0.0.1:{server.bserver.port}"
 
 
 async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
@@ -209,9 +207,7 @@ async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
         server.set_certificate_validator(await _only(trusted, untrusted))
 
 
-async def _add(
-    server: Any, ua: Any, tag: Tag, values: Callable[[], Mapping[str, Sequence[float]]]
-) -> None:
+async def _add(server: Any, ua: Any, tag: Tag, values: Values) -> None:
     """Add the node of a tag, whose value is found when somebody reads it."""
     node = _node_id(ua, tag)
     while node.NamespaceIndex >= len(await server.get_namespace_array()):

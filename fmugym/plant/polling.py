@@ -6,6 +6,7 @@ import asyncio
 import math
 from collections import deque
 from collections.abc import Sequence
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from typing import Final, NamedTuple, Protocol
 
 from fmugym.errors import FMUGymError
@@ -57,11 +58,11 @@ class Round(NamedTuple):
 class Client(Protocol):
     """Reads from a server. It has no method that writes."""
 
-    async def connect(self) -> None:
-        """Connect.
+    def connected(self) -> AbstractAsyncContextManager[None]:
+        """Connect, and disconnect in the end, whatever has happened before.
 
         Raises:
-            LostError: If that fails.
+            LostError: If it cannot connect.
         """
 
     async def read(self) -> dict[str, Answer]:
@@ -70,9 +71,6 @@ class Client(Protocol):
         Raises:
             LostError: If the server does not answer.
         """
-
-    async def close(self) -> None:
-        """Disconnect, whatever has happened before."""
 
 
 class Poller:
@@ -101,20 +99,19 @@ class Poller:
     async def _poll(self) -> None:
         while True:
             try:
-                await self._converse()
+                async with AsyncExitStack() as connection:
+                    await self._converse(connection)
             except ordinary(TimeoutError):
                 self._trouble = f"it does not answer within {self._timeout:g} s"
             except ordinary(Exception) as error:  # whatever a library makes of a broken line
                 is_own = isinstance(error, LostError)
                 self._trouble = str(error) if is_own else f"{type(error).__name__}: {error}"
                 self.is_refused = isinstance(error, RefusedError)
-            finally:
-                await self._client.close()
             await asyncio.sleep(self._interval / self._speed)
 
-    async def _converse(self) -> None:
+    async def _converse(self, connection: AsyncExitStack) -> None:
         async with asyncio.timeout(self._timeout):
-            await self._client.connect()
+            await connection.enter_async_context(self._client.connected())
         while True:
             begin = self._clock.time()
             async with asyncio.timeout(self._timeout):

@@ -43,7 +43,7 @@ class Predictions:
     They differ in the parameters that the task draws. The one that fits best predicts.
 
     Args:
-        make_env: Makes an environment with the time of the plant.
+        make_env: Makes an environment with the time of the plant, which the caller closes.
         feed: Has what the plant does.
         plant: Has the tags.
         steps: How many steps ahead there are predictions.
@@ -61,12 +61,8 @@ class Predictions:
         self._written: list[Written] = []
         self._spread: dict[str, FloatArray] = {}
         self._tags: list[tuple[int, str, Conversion]] = []
-        try:
-            if steps:
-                self._make(make_env)
-        except BaseException:
-            self.close()
-            raise
+        if steps:
+            self._make(make_env)
         self.names = [alias for _, alias, _ in self._tags]
         shape = (steps, len(self.names))
         self._sums, self._squares = np.zeros(shape), np.zeros(shape)
@@ -141,16 +137,10 @@ class Predictions:
     def errors(self) -> list[Error]:
         """The errors until now, by variable and horizon."""
         found = []
-        for place, name in enumerate(self.names):
-            for ahead in range(self._steps):
-                count = int(self._counts[ahead, place])
-                if count:
-                    rms = float(np.sqrt(self._squares[ahead, place] / count))
-                    bias = float(self._sums[ahead, place] / count)
-                    found.append(Error(name, (ahead + 1) * self._plant.step, rms, bias, count))
+        for place, ahead in np.argwhere(self._counts.T).tolist():
+            count = int(self._counts[ahead, place])
+            rms = float(np.sqrt(self._squares[ahead, place] / count))
+            bias = float(self._sums[ahead, place] / count)
+            seconds = (ahead + 1) * self._plant.step
+            found.append(Error(self.names[place], seconds, rms, bias, count))
         return found
-
-    def close(self) -> None:
-        """Free the copies."""
-        for env in self.envs:
-            env.close()

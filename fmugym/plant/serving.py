@@ -6,6 +6,7 @@ import asyncio
 import math
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final, Self
@@ -211,27 +212,20 @@ class Server:
 
     async def _serve(self) -> None:
         env: Any = self._player.make_env(lambda **form: environment(self._task, **form))
-        try:
+        with closing(env):
             plant = read_plant(env)
             policy, most = self._player.make_policy(env), self._steps or math.inf
             twin = _Twin(env, plant, policy, self._clock, self._seed, most)
             self.summary = twin.summary
-            end = await _SERVERS[plant["protocol"]](plant, self._port, twin.values, self._bound)
-            try:
+            serve = _SERVERS[plant["protocol"]]
+            async with serve(plant, self._port, twin.values) as self.address:
+                self._is_bound.set()
                 pause = plant.step / 2 / speed_of(self._clock)
                 is_over = False
                 while not is_over:
                     await asyncio.sleep(pause)
                     is_over = twin.is_over
                     twin.values()
-            finally:
-                await end()
-        finally:
-            env.close()
-
-    def _bound(self, address: str) -> None:
-        self.address = address
-        self._is_bound.set()
 
     def _raise(self) -> None:
         error = self._background.error

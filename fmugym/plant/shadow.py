@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -198,8 +198,7 @@ def connect(
     watched = _watched(task, feed)
     own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
-        env = environment(own, backend=feed)
-        stack.callback(env.close)
+        env = stack.enter_context(closing(environment(own, backend=feed)))
         plant = read_plant(env, address)
         written = Written(env, feed, plant)
         read, env.inside.held, samplings = _reading(env, feed, plant)
@@ -207,9 +206,11 @@ def connect(
         model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(
-            partial(environment, model), feed, plant, int(ahead / plant.step + 1e-9)
+            lambda: stack.enter_context(closing(environment(model))),
+            feed,
+            plant,
+            int(ahead / plant.step + 1e-9),
         )
-        stack.callback(copies.close)
         live = Live(env, plant)
         live.envs += copies.envs
         client = _CLIENTS[plant["protocol"]](plant)

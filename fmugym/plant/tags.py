@@ -26,7 +26,8 @@ class Tag:
 
     Attributes:
         name: The name in the task.
-        entry: Where it is declared; its value has the keys of the address.
+        entry: Where it is declared.
+        address: The keys of its address.
         conversion: From the plant's number to the unit of the task.
         count: How many numbers there are.
         low, high: The limits of the task, infinite where there are none.
@@ -34,6 +35,7 @@ class Tag:
 
     name: str
     entry: Entry
+    address: Mapping[str, Any]
     conversion: Conversion
     count: int = 1
     low: float = -math.inf
@@ -48,12 +50,6 @@ class Tag:
             f"got {number:.6g}, expected {self.low:g} to {self.high:g} or not far from it: are "
             "'type', 'word_order', 'scale' and 'unit' right?"
         )
-
-    @property
-    def address(self) -> Mapping[str, Any]:
-        """The keys of its address."""
-        found: Mapping[str, Any] = self.entry.value
-        return found
 
 
 @dataclass(frozen=True)
@@ -77,9 +73,6 @@ class Plant:
     hold: float
 
     def __getitem__(self, key: str) -> Any:
-        return self.entry.value[key]
-
-    def get(self, key: str) -> Any:
         """The value of a key; None if it is not given."""
         return self.entry.value.get(key)
 
@@ -136,13 +129,13 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
 def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
     quantities = env.inside.quantities
     known = {one.name: one for one in (quantities().all if quantities else ())}
+    others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
     for name, one in entry.child("tags").items().items():
-        if name not in known and name in (others := _others(env)):
-            continue  # a variable of the FMU that the task does not read
-        if name not in known:
+        if name in known:
+            limits = {"low": known[name].low, "high": known[name].high}
+            yield replace(_tag(env, name, one, known[name].unit), **limits)
+        elif name not in others:  # the task does not read the others
             raise one.error(unknown_name("variable of the task", name, [*known, *others]))
-        limits = {"low": known[name].low, "high": known[name].high}
-        yield replace(_tag(env, name, one, known[name].unit), **limits)
     if entry.child("clock").value is not None:
         yield _tag(env, "clock", entry.child("clock"), "s")
     for name, one in entry.child("data").items().items():
@@ -152,17 +145,13 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
             yield _tag(env, DATA + name, one, data[name].get("unit", ""))
 
 
-def _others(env: TaskEnv) -> set[str]:
-    return {*env.task.document.get("variables", ()), *env.fmu.description.variables}
-
-
 def _tag(env: TaskEnv, name: str, entry: Entry, unit: str) -> Tag:
     given = entry.value
     _require_protocol(entry, env.task.root.child("plant").child("protocol").value)
     with entry.placing():
         own = conversion_between(given.get("unit"), unit or None, env.fmu.description.units)
     raw = Conversion(given["scale"], given["offset"])
-    return Tag(name, entry, own.after(raw), given.get("count", 1))
+    return Tag(name, entry, given, own.after(raw), given.get("count", 1))
 
 
 def _require_protocol(entry: Entry, protocol: str) -> None:
