@@ -125,13 +125,16 @@ def _told_names(name: str) -> tuple[str, ...]:
 
 
 def _loops(graph: Mapping[int, Sequence[int]]) -> list[list[int]]:
-    return [c for c in strong_components(graph) if len(c) > 1 or c[0] in graph[c[0]]]
+    return [found for found in strong_components(graph) if _is_loop(graph, found)]
+
+
+def _is_loop(graph: Mapping[int, Sequence[int]], found: list[int]) -> bool:
+    return len(found) > 1 or found[0] in graph[found[0]]
 
 
 def _evaluations(graph: Mapping[int, Sequence[int]], loop: Loop) -> Iterator[Evaluation]:
     for found in strong_components(graph):
-        is_loop = len(found) > 1 or found[0] in graph[found[0]]
-        yield Evaluation(tuple(sorted(found)), loop if is_loop else None)
+        yield Evaluation(tuple(sorted(found)), loop if _is_loop(graph, found) else None)
 
 
 def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, tuple[str, ...]]:

@@ -199,7 +199,8 @@ def _variables(
             raise ConfigError(f"{name!r} is the name of two variables of {plan.name}")
         variables[connector.name] = variable
         elements |= names
-        ends += zip(*map(_elements_behind, behind), strict=True)
+        each = ([replace(end, variable=v) for v in end.variable.elements] for end in behind)
+        ends += zip(*each, strict=True)
     return variables, tuple(ends)
 
 
@@ -293,10 +294,6 @@ def _behind(
     if found.array is not None:
         variable = variable.elements[found.place]
     return PartVariable(part, variable, end.gain, end.offset, is_target)
-
-
-def _elements_behind(end: PartVariable) -> list[PartVariable]:
-    return [replace(end, variable=element) for element in end.variable.elements]
 
 
 def _connector_variable(connector: Connector, first: PartVariable, reference: int) -> Variable:
