@@ -132,7 +132,7 @@ def _unit(element: Any) -> Unit:
     displays = {
         display.get("displayUnit") or display.get("name") or "": _display_unit(display)
         for display in element.findall("DisplayUnit") + element.findall("DisplayUnitDefinition")
-        if display.get("inverse") not in {"true", "1"}  # one over the value: not linear
+        if not _is_set(display, "inverse")  # one over the value: not linear
     }
     if base is None:
         return Unit(display_units=displays)
@@ -220,23 +220,24 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
 
 def _provides(root: Any, element: str, kind: str) -> bool:
     """Read a flag for derivatives. FMI 3.0 spells it in the plural, which FMPy does not read."""
-    attributes = root.find(element).attrib
     names = (f"provides{kind}Derivative", f"provides{kind}Derivatives")
-    return any(attributes.get(name) in {"true", "1"} for name in names)
+    return any(_is_set(root.find(element), name) for name in names)
+
+
+def _is_set(element: Any, flag: str) -> bool:
+    return element.get(flag) in {"true", "1"}
 
 
 def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
     """Read the flags of FMI 1.0, which FMPy leaves out. FMI 1.0 has no FMU state."""
     flags = root.find("Implementation/*/Capabilities")
-    attributes = {} if flags is None else flags.attrib
-
-    def flag(name: str) -> bool:
-        return attributes.get(name) in {"true", "1"}
-
+    flags = {} if flags is None else flags.attrib
     return Capabilities(
         can_handle_variable_communication_step_size=interface == "model_exchange"
-        or flag("canHandleVariableCommunicationStepSize"),
-        can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
+        or _is_set(flags, "canHandleVariableCommunicationStepSize"),
+        can_be_instantiated_only_once_per_process=_is_set(
+            flags, "canBeInstantiatedOnlyOncePerProcess"
+        ),
         needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
     )
 
@@ -268,7 +269,7 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         ticking=ticking,
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
         shift=_shift(source, element, ticking),
-        by_fractions=element.get("supportsFraction") in {"true", "1"},
+        by_fractions=_is_set(element, "supportsFraction"),
     )
 
 

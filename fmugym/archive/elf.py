@@ -28,6 +28,8 @@ _HEADER: Final = struct.Struct("<16sHHIQQQIHHHHHH")
 _SEGMENT: Final = struct.Struct("<IIQQQQQQ")
 _SECTION: Final = struct.Struct("<IIQQQQIIQQ")
 _SYMBOL: Final = struct.Struct("<IBBHQQ")
+_ENTRY: Final = struct.Struct("<QQ")
+_INDEX: Final = struct.Struct("<H")
 _NEED: Final = struct.Struct("<HHIII")
 _NEEDED_VERSION: Final = struct.Struct("<IHHII")
 _SHARED: Final = 3
@@ -71,6 +73,11 @@ class BinaryFile:
         if len(content) < layout.size:
             raise _cut_short(self.name, self.size)
         return layout.unpack(content)
+
+    def rows(self, layout: struct.Struct, offset: int, count: int) -> Iterator[tuple[Any, ...]]:
+        """Read the whole structures that so many bytes hold; fewer at the end of the file."""
+        content = self.read(offset, count)
+        return layout.iter_unpack(content[: len(content) // layout.size * layout.size])
 
     def require(self, end: int) -> None:
         """Refuse a file that is shorter than ``end`` bytes."""
@@ -135,8 +142,7 @@ class ElfLibrary:
         """Tags and values of the dynamic section."""
         for segment in self._segments:
             if segment.kind == _DYNAMIC:
-                table = self._source.read(segment.offset, segment.size)
-                return list(struct.iter_unpack("<QQ", table[: len(table) // 16 * 16]))
+                return list(self._source.rows(_ENTRY, segment.offset, segment.size))
         return []
 
     @cached_property
@@ -208,14 +214,12 @@ class ElfLibrary:
     def _symbols(self) -> Iterator[tuple[str, bool]]:
         """The name of each symbol, and whether the library defines it itself."""
         for start, length in self._sections(_SYMBOL_TABLE):
-            table = self._source.read(start, length)
-            for row in _SYMBOL.iter_unpack(table[: len(table) // _SYMBOL.size * _SYMBOL.size]):
+            for row in self._source.rows(_SYMBOL, start, length):
                 yield self._string(row[0]), row[3] != 0
 
     def _versions_of_symbols(self) -> Iterator[int]:
         for start, length in self._sections(_VERSION_TABLE):
-            table = self._source.read(start, length)
-            for (index,) in struct.iter_unpack("<H", table[: len(table) // 2 * 2]):
+            for (index,) in self._source.rows(_INDEX, start, length):
                 yield index & 0x7FFF
 
     @cached_property

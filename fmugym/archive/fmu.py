@@ -12,17 +12,28 @@ import hashlib
 import logging
 import os
 import shlex
+import shutil
 import weakref
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Protocol, runtime_checkable
 
-from fmugym.archive.dependencies import ask_in_a_child, describe_missing, missing_libraries
+import fmpy
+
+from fmugym.archive import loader
+from fmugym.archive.bundled import is_bundled
+from fmugym.archive.dependencies import (
+    ask_in_a_child,
+    describe_missing,
+    load_globally,
+    missing_libraries,
+    stray_libraries,
+)
 from fmugym.archive.description import INTERFACES
 from fmugym.archive.executable import check_library
-from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough
@@ -33,7 +44,7 @@ from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.signals import ordinary
 from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
-__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU", "file_digest"]
+__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU", "copy_libraries", "file_digest"]
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +65,7 @@ class StandsForFMU(Protocol):
         """Open it, with a temporary folder of its own."""
 
 
-class FMU(LoadableFMU, KnownArguments):
+class FMU(KnownArguments):
     """An FMU archive and the temporary folder it is extracted to.
 
     Args:
@@ -76,6 +87,8 @@ class FMU(LoadableFMU, KnownArguments):
         limits, preload, probe_timeout: As given; ``preload`` a tuple with absolute paths.
         interface: As given; ``description.interface`` is the one in use.
         sizes: As given.
+        in_wine: Whether the library is one for Windows that can only run in Wine here.
+        isolated: Whether it is a system that shall run in worker processes.
 
     Raises:
         ConfigError: If an argument does not fit.
@@ -84,6 +97,8 @@ class FMU(LoadableFMU, KnownArguments):
     """
 
     sizes: Mapping[str, int] = MappingProxyType({})
+    in_wine = False
+    isolated = False
 
     def __init__(
         self,
@@ -111,12 +126,21 @@ class FMU(LoadableFMU, KnownArguments):
         if sizes:
             self.sizes = check_mapping("sizes", sizes)
             description = description.resized(self.sizes)
-        super().__init__(file, description, libraries)
+        self.path, self.description, self.preload = file, description, libraries
         self._library_place, note = self._choose_library()
         self.findings = (*self._archive.notes, *note, *self.description.findings)
         self._folder: Path | None = None
         self._remove_folder: weakref.finalize[..., FMU] | None = None
         self._log_findings()
+
+    def __repr__(self) -> str:
+        about = self.description
+        counts = Counter(variable.causality for variable in about.variables.values())
+        told = ", ".join(f"{counts[kind]} {kind}s" for kind in ("input", "output", "parameter"))
+        return (
+            f"{type(self).__name__}({str(self.path)!r}: {about.model_name}, FMI "
+            f"{about.fmi_version}, {told})"
+        )
 
     def _choose_library(self) -> tuple[str | None, list[str]]:
         """Find the library for this platform, or else one for Windows that can run here in Wine."""
@@ -145,16 +169,16 @@ class FMU(LoadableFMU, KnownArguments):
             return source.as_fmu()
         return source.again() if isinstance(source, FMU) else cls(source)
 
-    def again(self, folder: Path | None = None) -> FMU:
-        """The same FMU once more, which is not read again.
-
-        Args:
-            folder: Where somebody has extracted it, who removes it, too; None for a temporary
-                folder of its own.
-        """
+    def again(self) -> FMU:
+        """The same FMU once more, which is not read again, with a temporary folder of its own."""
         other = copy.copy(self)
-        other._folder, other._remove_folder = folder, None
+        other._folder, other._remove_folder = None, None
         return other
+
+    @property
+    def bundled(self) -> bool:
+        """Whether it comes with the package."""
+        return is_bundled(self.path)
 
     @property
     def content(self) -> str:
@@ -227,6 +251,90 @@ class FMU(LoadableFMU, KnownArguments):
 
     def _missing_in(self, folder: Path) -> tuple[str, ...]:
         return tuple(missing_libraries(folder / self.library, self.preload, ask_in_a_child))
+
+    def parts_in(self, folder: Path) -> Sequence[tuple[FMU, Path]]:
+        """The FMUs of a system, or this one, and where each is in a folder like ``extract``'s."""
+        return [(self, folder)]
+
+    def libraries_in(self, folder: Path) -> list[tuple[FMU, Path]]:
+        """The same FMUs, and their libraries there."""
+        return [(part, place / part.library) for part, place in self.parts_in(folder)]
+
+    def libraries_before(self, folder: Path) -> list[tuple[str, str]]:
+        """The libraries to load before those of the FMUs.
+
+        Args:
+            folder: As for ``libraries_in``.
+
+        Returns:
+            Names and paths, in the order in which they are to be loaded: those of ``preload``
+            without a name, and those that an FMU brings along where the loader does not look. Such
+            a one is loaded only if the loader finds none of its name.
+        """
+        return [
+            before
+            for fmu, library in self.libraries_in(folder)
+            for before in (
+                *(("", path) for path in fmu.preload),
+                *((path.name, str(path)) for path in stray_libraries(library)),
+            )
+        ]
+
+    def require_libraries(
+        self, folder: Path, ask: Callable[[Sequence[str]], list[str]] = ask_in_a_child
+    ) -> None:
+        """Require that the loader finds all libraries that those of the FMUs need.
+
+        Args:
+            folder: As for ``libraries_in``.
+            ask: See ``missing_libraries``.
+
+        Raises:
+            FMULoadError: If others are missing, or one that the FMU brings along is cut short.
+        """
+        for fmu, library in self.libraries_in(folder):
+            missing = missing_libraries(library, fmu.preload, ask)
+            if missing:
+                raise FMULoadError(describe_missing(fmu.path.name, missing))
+
+    def prepare_libraries(self) -> list[Path]:
+        """Make the libraries of all FMUs ready to be loaded into this process.
+
+        Loads those that are to be loaded before, and finds out which others are missing.
+
+        Returns:
+            Their paths, in the folder of ``extract``; several for a system.
+
+        Raises:
+            FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
+                are missing; or if it is a library for Windows, which needs a process in Wine.
+        """
+        if self.in_wine:
+            raise FMULoadError(
+                f"{self.path.name} has no library for this platform. Environments run its library "
+                "for Windows in worker processes in Wine, but this process cannot load it"
+            )
+        folder = self.extract()
+        for path in {path: None for fmu, _ in self.libraries_in(folder) for path in fmu.preload}:
+            load_globally(path)
+        self.require_libraries(folder, loader.ask)
+        for name, path in self.libraries_before(folder):
+            if name and loader.ask([name]):
+                load_globally(path)
+        return [library for _, library in self.libraries_in(folder)]
+
+    @property
+    def platform(self) -> str:
+        """The folder under ``binaries/`` that this machine needs."""
+        if self.in_wine:
+            return "x86_64-windows" if self.description.fmi_major_version == 3 else "win64"
+        return self.description.platform
+
+    @property
+    def library(self) -> str:
+        """The place of the library for this machine, relative to the folder of ``extract``."""
+        suffix = ".dll" if self.in_wine else fmpy.sharedLibraryExtension
+        return f"binaries/{self.platform}/{self.description.model_identifier}{suffix}"
 
     def extract(self) -> Path:
         """Extract what this machine needs, once, into a temporary folder.
@@ -320,6 +428,34 @@ class FMU(LoadableFMU, KnownArguments):
             _, remove, arguments, _ = alive
             remove(*arguments)
             finalizer.detach()  # not before: a signal may have interrupted the removal
+
+
+def copy_libraries(fmu: FMU, count: int) -> list[Path]:
+    """Copy the libraries of all parts, so that each instance has global variables of its own."""
+    copies = [
+        _copy_library(place, Path(part.library), count)
+        for part, place in fmu.parts_in(fmu.extract())
+    ]
+    return [path for paths in zip(*copies, strict=True) for path in paths]
+
+
+def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
+    """Copy the library's folder: the system treats files with other paths and inodes as new.
+
+    The copies are in the FMU's temporary folder and are deleted with it.
+    """
+    paths = []
+    try:
+        for index in range(count):
+            copy = folder / "private" / str(index)
+            shutil.copytree(folder / library.parent, copy)
+            paths.append(copy / library.name)
+    except ordinary(OSError, shutil.Error) as error:
+        raise FMULoadError(
+            f"{library.name} needs a copy for each instance, but copy {len(paths) + 1} of {count} "
+            f"failed: {error}; use fewer instances, or one process for each"
+        ) from None
+    return paths
 
 
 def file_digest(path: Path) -> str:

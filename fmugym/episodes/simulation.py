@@ -28,21 +28,17 @@ __all__ = [
 ]
 
 
-def _begin() -> None:
-    """A policy without a memory has nothing to forget."""
-
-
 @dataclass(frozen=True)
 class Policy:
     """Chooses actions.
 
     Attributes:
         act: Returns the action for an observation.
-        begin: Is called before an episode begins.
+        begin: Is called before an episode begins; without a memory there is nothing to forget.
     """
 
     act: Callable[[Any], Any]
-    begin: Callable[[], None] = _begin
+    begin: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)

@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
-
-from fmugym.checks import check_dict, check_integer
 from fmugym.errors import ConfigError, shown
-from fmugym.lab.cell import Cell, checked_parameters
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, LabError, UserInfo
 from fmugym.lab.disturbance import Disturbance
-from fmugym.lab.presets import Options, make_options
 from fmugym.lab.request_checks import Request
 from fmugym.lab.service import Service
 from fmugym.lab.sessions import Session
-from fmugym.lab.users import User
-from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.signals import ordinary
 
 __all__ = ["Client", "Lab", "current_lab"]
-
-_CELLS: Final = {CellType.SINGLE: 4, CellType.DOUBLE: 2}
-_FIRST_ID: Final = {CellType.SINGLE: 101, CellType.DOUBLE: 201}
-_MOST_CELLS: Final = 100  # of a type, so that the numbers of the types do not overlap
-_LARGEST_SEED: Final = 2**128 - 1
 
 Disturbances = str | Disturbance | Sequence[Disturbance] | None
 Reading = float | list[float]
@@ -264,33 +251,6 @@ class Lab(Service):
         ConfigError: If an argument has a wrong type or is out of its range.
     """
 
-    def __init__(
-        self,
-        preset: str | Options = "hardware",
-        *,
-        clock: Clock | None = None,
-        speed: float = 1.0,
-        users: Mapping[str, User] | None = None,
-        cells: Mapping[CellType, int] | None = None,
-        seed: int | None = None,
-        parameters: Mapping[CellType, Mapping[str, float]] | None = None,
-        video_folder: str | Path | None = None,
-        **changes: Any,
-    ) -> None:
-        options = make_options(preset, **changes)
-        if seed is not None:
-            seed = check_integer("seed", seed, 0, _LARGEST_SEED)
-        seeds = np.random.SeedSequence(seed)
-        rng = _rng(seeds)
-        super().__init__(
-            options,
-            RealClock(speed) if clock is None else clock,
-            _make_cells(options, seeds, _numbers(cells), _parameters(parameters)),
-            users,
-            rng,
-            video_folder,
-        )
-
     def __enter__(self) -> Lab:
         with _choosing:
             _blocks.append(self)
@@ -332,41 +292,3 @@ def current_lab() -> Lab:
         if not _default or _default[0].is_closed:
             _default[:] = [Lab()]
         return _default[0]
-
-
-def _make_cells(
-    options: Options,
-    seeds: np.random.SeedSequence,
-    numbers: Mapping[CellType, int],
-    parameters: Mapping[CellType, Mapping[str, float]],
-) -> list[Cell]:
-    return [
-        Cell(_FIRST_ID[kind] + i, kind, options, _rng(seeds), parameters.get(kind, {}))
-        for kind in CellType
-        for i in range(numbers.get(kind, 0))
-    ]
-
-
-def _numbers(cells: Any) -> Mapping[CellType, int]:
-    numbers = _by_type("cells", _CELLS if cells is None else cells)
-    return {
-        kind: check_integer(f"cells: the number of {kind.name} cells", count, 0, _MOST_CELLS)
-        for kind, count in numbers.items()
-    }
-
-
-def _parameters(parameters: Any) -> dict[CellType, dict[str, float]]:
-    by_type = _by_type("parameters", {} if parameters is None else parameters)
-    return {kind: checked_parameters(kind, values) for kind, values in by_type.items()}
-
-
-def _by_type(what: str, value: Any) -> dict[CellType, Any]:
-    entries = check_dict(what, value)
-    for kind in entries:
-        if not isinstance(kind, CellType):
-            raise ConfigError(f"{what}: expected a CellType as a key, not {shown(kind)}")
-    return entries
-
-
-def _rng(seeds: np.random.SeedSequence) -> np.random.Generator:
-    return np.random.default_rng(seeds.spawn(1)[0])

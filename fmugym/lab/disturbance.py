@@ -49,7 +49,7 @@ class Disturbance(Protocol):
 
     @property
     def position(self) -> Sequence[float] | None:
-        """The position to which it pulls the joints, in rad; None if it adds a torque."""
+        """The position to which it pulls the joints, in rad; None for hanging down or a torque."""
         ...
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
@@ -81,9 +81,9 @@ class _Pull(_Checked):
     torque = None
 
     @property
-    def position(self) -> Sequence[float]:
-        """The position to which it pulls the joints, in rad."""
-        return self.disturbance_position or (0.0, 0.0)
+    def position(self) -> Sequence[float] | None:
+        """The position to which it pulls the joints, in rad; None for hanging down."""
+        return self.disturbance_position
 
 
 class _Near:

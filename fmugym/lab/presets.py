@@ -12,8 +12,6 @@ from fmugym.errors import ConfigError, shown
 
 __all__ = ["HARDWARE", "IDEAL", "PRESETS", "Options", "make_options"]
 
-_PAIRS: Final = ("coulomb_friction", "encoder_step", "velocity_noise", "get_time", "set_time")
-_FLAGS: Final = ("saturate_torque", "clamp_setters")
 _SHARES: Final = ("early_sample_share", "stall_share")
 _LIMITS: Final = (
     *("heartbeat", "torque_limit", "velocity_limit", "position_limit", "peak_torque"),
@@ -108,7 +106,8 @@ class Options:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            object.__setattr__(self, field.name, _checked(field.name, getattr(self, field.name)))
+            value = _checked(field.name, getattr(self, field.name), field.default)
+            object.__setattr__(self, field.name, value)
         stalls = (self.shortest_stall, self.longest_stall)
         _require_order("shortest_stall and longest_stall", stalls)
         for name in ("coulomb_friction", "get_time", "set_time"):
@@ -119,10 +118,10 @@ class Options:
                 raise ConfigError(f"{name}: {p99:g} s is more than {_LARGEST_SPREAD:g} medians")
 
 
-def _checked(name: str, value: Any) -> Any:
-    if name in _PAIRS:
+def _checked(name: str, value: Any, default: Any) -> Any:
+    if isinstance(default, tuple):
         return _pair(name, value)
-    if name in _FLAGS:
+    if isinstance(default, bool):
         return check_flag(name, value)
     if name == "starts_per_window":
         return None if value is None else check_integer(name, value, 0, 10**9)

@@ -11,8 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.checks import check_flag, check_number, check_option, check_text, float_or_nan
-from fmugym.errors import shown
+from fmugym.checks import (
+    check_flag,
+    check_number,
+    check_option,
+    check_text,
+    float_or_nan,
+    number_of,
+)
+from fmugym.errors import ConfigError, shown
 from fmugym.lab.data import CellType, LabError, as_lab_error
 from fmugym.lab.disturbance import Disturbance, resolve
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
@@ -177,11 +184,9 @@ def gains_of(value: Any, joints: int, name: str) -> list[float | None]:
 
 def _finite(entry: Any, name: str) -> float:
     try:
-        if isinstance(entry, str | bytes | bytearray):
-            raise TypeError
-        result = float(entry)
-    except ordinary(Exception):
+        number = number_of(name, entry, may_be_boolean=True)
+    except ConfigError:
         raise LabError(f"{name} must be a number for each joint, not {shown(entry)}") from None
-    if not math.isfinite(result):
+    if not math.isfinite(number):
         raise LabError(f"{name} must be finite, not {shown(entry)}")
-    return result
+    return number

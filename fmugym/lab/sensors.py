@@ -4,30 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from fmugym.lab.presets import Options
 
-__all__ = ["Sample", "Sensors"]
+__all__ = ["Sensors"]
 
 _BLOCK = 64  # rows of random numbers drawn at once, as single draws are slow
-
-
-@dataclass(frozen=True)
-class Sample:
-    """The readings of one moment.
-
-    Attributes:
-        position: Angle of each joint, in rad.
-        velocity: Angular velocity of each joint, in rad/s.
-        torque: Torque of each motor, in N m.
-    """
-
-    position: list[float]
-    velocity: list[float]
-    torque: list[float]
 
 
 class Sensors:
@@ -39,7 +23,8 @@ class Sensors:
         rng: The random generator of the noise.
 
     Attributes:
-        sample: The newest sample. Every reading repeats it until the next sample.
+        sample: The newest readings, a number for each joint: ``"position"`` in rad,
+            ``"velocity"`` in rad/s and ``"torque"`` in N m. They stay until the next sample.
     """
 
     def __init__(self, options: Options, joints: int, rng: np.random.Generator) -> None:
@@ -49,7 +34,7 @@ class Sensors:
         lag = options.velocity_lag
         self._gain = 1.0 if lag == 0.0 else -math.expm1(-self._step / lag)
         self._noise: list[list[float]] = []
-        self.sample = Sample([0.0] * joints, [0.0] * joints, [0.0] * joints)
+        self.sample: dict[str, list[float]] = {}
 
     def restart(self, position: Sequence[float]) -> None:
         """Begin a session with joints at rest, at positions in rad."""
@@ -77,11 +62,12 @@ class Sensors:
         options, (of_velocity, of_torque, early) = self._options, self._draw()
         sigmas = options.velocity_noise[: self._joints]
         velocities = zip(self._filtered, sigmas, of_velocity, strict=True)
-        self.sample = Sample(
-            list(map(_quantized, position, options.encoder_step)),
-            [v + sigma * x for v, sigma, x in velocities],
-            [tau + options.torque_noise * x for tau, x in zip(torque, of_torque, strict=True)],
-        )
+        torques = zip(torque, of_torque, strict=True)
+        self.sample = {
+            "position": list(map(_quantized, position, options.encoder_step)),
+            "velocity": [v + sigma * x for v, sigma, x in velocities],
+            "torque": [tau + options.torque_noise * x for tau, x in torques],
+        }
         is_early = self._period > 1 and early < options.early_sample_share
         self._due = self._count + (self._period // 2 if is_early else self._period)
 

@@ -9,25 +9,26 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_option
+from fmugym.checks import check_dict, check_integer, check_option
+from fmugym.errors import ConfigError, shown
 from fmugym.lab.bookings import Bookings, new_token
-from fmugym.lab.cell import Cell
+from fmugym.lab.cell import Cell, checked_parameters
 from fmugym.lab.cell_pictures import CellPicture, LiveView
 from fmugym.lab.data import CellInfo, CellType, LabError, UserInfo, as_lab_error
-from fmugym.lab.presets import Options
+from fmugym.lab.presets import Options, make_options
 from fmugym.lab.request_checks import Request, cell_types_of, check_range, text_of
 from fmugym.lab.sessions import Gym, Session
 from fmugym.lab.timekeeper import Delays, Timekeeper
 from fmugym.lab.users import Account, Accounts, User
 from fmugym.lab.videos import Recording, VideoFolder
-from fmugym.pool.backend.clocks import Clock
+from fmugym.pool.backend.clocks import Clock, RealClock
 
 __all__ = ["Service"]
 
@@ -37,41 +38,43 @@ _LONGEST_PREPARATION: Final = 60.0  # s
 _POLL: Final = 0.02  # s between two attempts to get a cell
 _RENDER_MODES: Final = ("rgb_array", "human")
 
+_CELLS: Final = {CellType.SINGLE: 4, CellType.DOUBLE: 2}
+_FIRST_ID: Final = {CellType.SINGLE: 101, CellType.DOUBLE: 201}
+_MOST_CELLS: Final = 100  # of a type, so that the numbers of the types do not overlap
+_LARGEST_SEED: Final = 2**128 - 1
+
 _Answer = TypeVar("_Answer")
 
 
 class Service:
     """Answers the requests of clients.
 
-    Args:
-        options: What is simulated.
-        clock: The lab's time.
-        cells: The lab's cells.
-        users: The users by their tokens, or None; see `Accounts`.
-        rng: The random generator of the network's delays.
-        video_folder: The folder of videos, or None; see `VideoFolder`.
-
-    Attributes:
-        options: What is simulated.
-        clock: The lab's time.
-
-    Raises:
-        ConfigError: If the clock, the users or the folder cannot be used.
+    See ``fmugym.lab.Lab`` for the arguments, the attributes and the errors.
     """
 
     def __init__(
         self,
-        options: Options,
-        clock: Clock,
-        cells: Sequence[Cell],
-        users: Any,
-        rng: np.random.Generator,
-        video_folder: str | Path | None,
+        preset: str | Options = "hardware",
+        *,
+        clock: Clock | None = None,
+        speed: float = 1.0,
+        users: Mapping[str, User] | None = None,
+        cells: Mapping[CellType, int] | None = None,
+        seed: int | None = None,
+        parameters: Mapping[CellType, Mapping[str, float]] | None = None,
+        video_folder: str | Path | None = None,
+        **changes: Any,
     ) -> None:
-        self.options, self.clock = options, clock
-        self._time = Timekeeper(clock)
+        if seed is not None:
+            seed = check_integer("seed", seed, 0, _LARGEST_SEED)
+        seeds = np.random.SeedSequence(seed)
+        rng = _rng(seeds)
+        self.options = options = make_options(preset, **changes)
+        self.clock = RealClock(speed) if clock is None else clock
+        made = _make_cells(options, seeds, _numbers(cells), _parameters(parameters))
+        self._time = Timekeeper(self.clock)
         self._delays = Delays(options, self._time, rng)
-        self._bookings = Bookings(cells)
+        self._bookings = Bookings(made)
         self._accounts = Accounts(users, options, self._time.opened)
         self._videos = VideoFolder(video_folder)
         self._lock = threading.RLock()
@@ -349,3 +352,41 @@ class Service:
             )
             self._bookings.begin(session)
             return session.token
+
+
+def _make_cells(
+    options: Options,
+    seeds: np.random.SeedSequence,
+    numbers: Mapping[CellType, int],
+    parameters: Mapping[CellType, Mapping[str, float]],
+) -> list[Cell]:
+    return [
+        Cell(_FIRST_ID[kind] + i, kind, options, _rng(seeds), parameters.get(kind, {}))
+        for kind in CellType
+        for i in range(numbers.get(kind, 0))
+    ]
+
+
+def _numbers(cells: Any) -> Mapping[CellType, int]:
+    numbers = _by_type("cells", _CELLS if cells is None else cells)
+    return {
+        kind: check_integer(f"cells: the number of {kind.name} cells", count, 0, _MOST_CELLS)
+        for kind, count in numbers.items()
+    }
+
+
+def _parameters(parameters: Any) -> dict[CellType, dict[str, float]]:
+    by_type = _by_type("parameters", {} if parameters is None else parameters)
+    return {kind: checked_parameters(kind, values) for kind, values in by_type.items()}
+
+
+def _by_type(what: str, value: Any) -> dict[CellType, Any]:
+    entries = check_dict(what, value)
+    for kind in entries:
+        if not isinstance(kind, CellType):
+            raise ConfigError(f"{what}: expected a CellType as a key, not {shown(kind)}")
+    return entries
+
+
+def _rng(seeds: np.random.SeedSequence) -> np.random.Generator:
+    return np.random.default_rng(seeds.spawn(1)[0])

@@ -164,7 +164,7 @@ class Session:
 
     def read(self, quantity: Quantity) -> float | list[float]:
         """Return the newest reading: a float for one actuator, a list for two."""
-        values: list[float] = getattr(self.cell.sensors.sample, quantity)
+        values = self.cell.sensors.sample[quantity]
         return values[0] if len(values) == 1 else list(values)
 
     def command(self, quantity: Quantity, value: Any) -> None:

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
-from typing import Any, Final
+from typing import Any
 
 from fmugym.checks import check_flag, check_integer, check_number, check_option, check_text
 from fmugym.errors import ConfigError, shown
@@ -16,8 +16,6 @@ from fmugym.lab.experiments import EXPERIMENTS
 from fmugym.lab.presets import Options
 
 __all__ = ["Account", "Accounts", "Bucket", "User"]
-
-_COUNTS: Final = ("number_of_attempts", "max_bucket_size", "gym_max_bucket_size")
 
 
 @dataclass(frozen=True)
@@ -53,16 +51,17 @@ class User:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            object.__setattr__(self, field.name, _checked(field.name, getattr(self, field.name)))
+            value = _checked(field.name, getattr(self, field.name), field.default)
+            object.__setattr__(self, field.name, value)
 
 
-def _checked(name: str, value: Any) -> Any:
+def _checked(name: str, value: Any, default: Any) -> Any:
     what = f"{name} of a user"
     if name == "gym":
         return check_flag(what, value)
     if name == "experiment_types":
         return _known_types(value)
-    if name in _COUNTS:
+    if isinstance(default, int):
         return check_integer(what, value, 0, 10**9)
     if name == "refil_interval":
         return check_number(what, value, 1e-3, 1e9)

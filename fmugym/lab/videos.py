@@ -11,7 +11,6 @@ import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +23,7 @@ from fmugym.lab.cell_pictures import CellPicture
 from fmugym.lab.data import LabError
 from fmugym.signals import ordinary
 
-__all__ = ["FRAME_RATE", "Moment", "Recording", "VideoFolder"]
+__all__ = ["FRAME_RATE", "Recording", "VideoFolder"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,28 +36,16 @@ _FFMPEG: Final = "imageio_ffmpeg"
 Frame = npt.NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class Moment:
-    """The content of a frame.
-
-    Attributes:
-        position: Angle of each joint, in rad.
-        torque: Torque of each motor, in N m.
-    """
-
-    position: Sequence[float]
-    torque: Sequence[float]
-
-
 class Recording:
     """The moments of a session, ``FRAME_RATE`` of them per second.
 
     Attributes:
-        moments: The moments, beginning with the start of the session.
+        moments: The angles of the joints in rad and the torques of the motors in N m, beginning
+            with the start of the session.
     """
 
     def __init__(self) -> None:
-        self.moments: list[Moment] = []
+        self.moments: list[tuple[Sequence[float], Sequence[float]]] = []
 
     def observe(self, time: float, position: Sequence[float], torque: Sequence[float]) -> None:
         """Keep this moment if a frame is due.
@@ -69,7 +56,7 @@ class Recording:
             torque: Torque of each motor, in N m.
         """
         if time * FRAME_RATE >= len(self.moments) - 1e-6:
-            self.moments.append(Moment(position, torque))
+            self.moments.append((position, torque))
 
     def cut(self, duration: float) -> None:
         """Keep the frames that begin within a duration in s, and at least one frame."""
@@ -165,7 +152,7 @@ def _write_video(recording: Recording, picture: CellPicture, folder: Path, name:
 
 def _frames(recording: Recording, picture: CellPicture) -> Iterable[Frame]:
     for index, moment in enumerate(recording.moments):
-        yield picture.draw(moment.position, moment.torque, index / FRAME_RATE, _SIZE)
+        yield picture.draw(*moment, index / FRAME_RATE, _SIZE)
 
 
 def _write_mp4(frames: Iterable[Frame], path: Path) -> Path:

@@ -365,18 +365,18 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
     space = float_box(env.action_space, "action")
     up, down, widths = moved_both_ways(space, action[None], precise_step(space))
     slopes = np.empty((len(env.inside.spec.inputs), action.size))
-    for place in np.ndindex(action.shape):
-        ends = (_inputs_of(env, _replaced(action, place, one[0][place])) for one in (up, down))
+    for column in range(action.size):
+        ends = (_inputs_of(env, _replaced(action, column, one)) for one in (up, down))
         upper, lower = map(np.array, ends)
-        column = np.ravel_multi_index(place, action.shape) if place else 0
-        slopes[:, column] = (upper - lower) / widths[0][place]
+        slopes[:, column] = (upper - lower) / widths.flat[column]
     _inputs_of(env, action)
     return slopes
 
 
-def _replaced(action: npt.NDArray[Any], place: tuple[int, ...], value: Any) -> npt.NDArray[Any]:
+def _replaced(action: npt.NDArray[Any], column: int, other: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """An action with one number of another one."""
     moved = np.array(action)
-    moved[place] = value
+    moved.flat[column] = other.flat[column]
     return moved
 
 

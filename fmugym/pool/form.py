@@ -21,7 +21,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.loadable import LoadableFMU
+from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of
 from fmugym.archive.variable import Variable, unlisted
 from fmugym.pool.spec import (
@@ -216,7 +216,7 @@ class Files:
     resources: tuple[bytes, ...]
 
     @classmethod
-    def here(cls, fmu: LoadableFMU, folder: Path, paths: Sequence[Path]) -> Files:
+    def here(cls, fmu: FMU, folder: Path, paths: Sequence[Path]) -> Files:
         """For a process of this system.
 
         Args:
@@ -228,39 +228,28 @@ class Files:
             tuple(os.fsencode(path) for path in paths),
             tuple(
                 os.fsencode(os.path.join(place, "resources", ""))
-                if version == 3
-                else _place_of_resources(place, version).as_uri().encode()
-                for _, place, version in _places(fmu, folder)
+                if part.description.fmi_major_version == 3
+                else _place_of_resources(part, place).as_uri().encode()
+                for part, place in fmu.parts_in(folder)
             ),
         )
 
     @classmethod
-    def in_wine(cls, fmu: LoadableFMU, folder: Path) -> Files:
+    def in_wine(cls, fmu: FMU, folder: Path) -> Files:
         """For a process in Wine, which has no private copies; see ``here``."""
-        places = _places(fmu, folder)
         return cls(
-            tuple(os.fsencode(windows_path(place / one.library)) for one, place, _ in places),
+            tuple(os.fsencode(windows_path(path)) for _, path in fmu.libraries_in(folder)),
             tuple(
                 os.fsencode(windows_path(place / "resources") + "\\")
-                if version == 3
-                else os.fsencode(windows_uri(_place_of_resources(place, version)))
-                for _, place, version in places
+                if part.description.fmi_major_version == 3
+                else os.fsencode(windows_uri(_place_of_resources(part, place)))
+                for part, place in fmu.parts_in(folder)
             ),
         )
 
 
-def _places(fmu: LoadableFMU, folder: Path) -> list[tuple[LoadableFMU, Path, int]]:
-    """Each FMU, where it was extracted to, and its major FMI version."""
-    if not fmu.parts:
-        return [(fmu, folder, fmu.description.fmi_major_version)]
-    return [
-        (part, folder / str(number), part.description.fmi_major_version)
-        for number, part in enumerate(fmu.parts)
-    ]
-
-
-def _place_of_resources(folder: Path, version: int) -> Path:
-    return folder if version == 1 else folder / "resources"
+def _place_of_resources(fmu: FMU, folder: Path) -> Path:
+    return folder if fmu.description.fmi_major_version == 1 else folder / "resources"
 
 
 # A pool

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable
 from typing import Final, ParamSpec, TypeVar
 
-from fmugym.archive.loadable import LoadableFMU
+from fmugym.archive.fmu import FMU
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.health import Column, HealthArray
@@ -135,7 +135,7 @@ class LeakWatch:
 
 
 def watch_leaks(
-    fmu: LoadableFMU,
+    fmu: FMU,
     spec: PoolSpec,
     counts: HealthArray,
     log: logging.Logger,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from fmugym.archive.loadable import LoadableFMU
+from fmugym.archive.fmu import FMU
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.retrying import ResetRetry
 from fmugym.pool.saving_pool import SavingPool
@@ -15,7 +15,7 @@ __all__ = ["local_pool"]
 
 @licence_errors()
 def local_pool(
-    fmu: LoadableFMU,
+    fmu: FMU,
     spec: PoolSpec,
     num_instances: int,
     log: logging.Logger,

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.loadable import LoadableFMU, copy_libraries
+from fmugym.archive.fmu import FMU, copy_libraries
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
@@ -90,7 +90,7 @@ class NativePool(AskingPool):
 
     def __init__(
         self,
-        fmu: LoadableFMU,
+        fmu: FMU,
         spec: PoolSpec,
         num_instances: int,
         log: logging.Logger,
@@ -129,13 +129,12 @@ class NativePool(AskingPool):
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
         paths = fmu.prepare_libraries()
-        folder = fmu.extract()
         if private_libraries:
-            paths = copy_libraries(fmu, folder, self.num_instances)
+            paths = copy_libraries(fmu, self.num_instances)
         form = form_of_pool(
             description,
             spec,
-            Files.here(fmu, folder, paths),
+            Files.here(fmu, fmu.extract(), paths),
             self.num_instances,
             self.threads,
             private_libraries=private_libraries,
@@ -418,6 +417,6 @@ def _as_mask(mask: MaskArray | None) -> MaskArray | None:
     return None if mask is None else np.asarray(mask, np.bool_)
 
 
-def _close(pool: _native.Pool, fmu: LoadableFMU) -> None:
+def _close(pool: _native.Pool, fmu: FMU) -> None:
     pool.close()
     fmu.close()

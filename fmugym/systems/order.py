@@ -8,8 +8,8 @@ comes after all it depends on.
 from __future__ import annotations
 
 from collections.abc import Container, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from dataclasses import dataclass
+from typing import TypeVar
 
 from fmugym.archive.structure import Feedthrough
 from fmugym.systems.system_plan import Evaluation, Group, Link, Loop
@@ -125,13 +125,16 @@ def _told_names(name: str) -> tuple[str, ...]:
 
 
 def _loops(graph: Mapping[int, Sequence[int]]) -> list[list[int]]:
-    return [c for c in strong_components(graph) if len(c) > 1 or c[0] in graph[c[0]]]
+    return [found for found in strong_components(graph) if _is_loop(graph, found)]
+
+
+def _is_loop(graph: Mapping[int, Sequence[int]], found: list[int]) -> bool:
+    return len(found) > 1 or found[0] in graph[found[0]]
 
 
 def _evaluations(graph: Mapping[int, Sequence[int]], loop: Loop) -> Iterator[Evaluation]:
     for found in strong_components(graph):
-        is_loop = len(found) > 1 or found[0] in graph[found[0]]
-        yield Evaluation(tuple(sorted(found)), loop if is_loop else None)
+        yield Evaluation(tuple(sorted(found)), loop if _is_loop(graph, found) else None)
 
 
 def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, tuple[str, ...]]:
@@ -174,55 +177,10 @@ def _acts(link: Link, told: Mapping[str, Feedthrough]) -> bool:
     return any(not inputs.isdisjoint(names) for inputs in told[link.target].in_step.values())
 
 
-@dataclass
-class _Search(Generic[Node]):
-    """The state of a depth-first search, which uses no recursion: systems may be long chains."""
-
-    graph: Mapping[Node, Sequence[Node]]
-    index: dict[Node, int] = field(default_factory=dict)
-    low: dict[Node, int] = field(default_factory=dict)
-    stack: list[Node] = field(default_factory=list)
-    on_stack: set[Node] = field(default_factory=set)
-    found: list[list[Node]] = field(default_factory=list)
-
-    def visit(self, root: Node) -> None:
-        path = [(root, iter(self.graph[root]))]
-        self._enter(root)
-        while path:
-            node, successors = path[-1]
-            after = next(successors, None)
-            if after is None:
-                path.pop()
-                self._leave(node)
-                if path:
-                    self._lower(path[-1][0], self.low[node])
-            elif after not in self.index:
-                self._enter(after)
-                path.append((after, iter(self.graph[after])))
-            elif after in self.on_stack:
-                self._lower(node, self.index[after])
-
-    def _enter(self, node: Node) -> None:
-        self.index[node] = self.low[node] = len(self.index)
-        self.stack.append(node)
-        self.on_stack.add(node)
-
-    def _lower(self, node: Node, value: int) -> None:
-        self.low[node] = min(self.low[node], value)
-
-    def _leave(self, node: Node) -> None:
-        if self.low[node] < self.index[node]:
-            return
-        component = [self.stack.pop()]
-        while component[-1] != node:
-            component.append(self.stack.pop())
-        component.reverse()
-        self.on_stack.difference_update(component)
-        self.found.append(component)
-
-
 def strong_components(graph: Mapping[Node, Sequence[Node]]) -> list[list[Node]]:
     """Find the strongly connected components of a graph.
+
+    The search uses no recursion, since systems may be long chains.
 
     Args:
         graph: For each node, those it depends on.
@@ -230,8 +188,30 @@ def strong_components(graph: Mapping[Node, Sequence[Node]]) -> list[list[Node]]:
     Returns:
         The components, each after all it depends on.
     """
-    search: _Search[Node] = _Search(graph)
-    for node in graph:
-        if node not in search.index:
-            search.visit(node)
-    return search.found
+    places: dict[Node, int] = {}  # in the stack
+    low: dict[Node, int] = {}  # the lowest place that a node leads to; beyond all if it is found
+    rest: dict[Node, Iterator[Node]] = {}
+    stack: list[Node] = []
+    found: list[list[Node]] = []
+    for root in graph:
+        path = [] if root in low else [root]
+        while path:
+            node = path[-1]
+            if node not in low:
+                places[node] = low[node] = len(stack)
+                rest[node] = iter(graph[node])
+                stack.append(node)
+            for after in rest[node]:
+                if after not in low:
+                    path.append(after)
+                    break
+                low[node] = min(low[node], low[after])
+            else:
+                path.pop()
+                if low[node] == places[node]:
+                    found.append(stack[places[node] :])
+                    del stack[places[node] :]
+                    low |= dict.fromkeys(found[-1], len(graph))
+                if path:
+                    low[path[-1]] = min(low[path[-1]], low[node])
+    return found

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -119,9 +120,8 @@ class Layout:
         outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
         own_inputs, own_outputs = _by_part(ins), _by_part(outs)
         for index, part in enumerate(self.parts):
-            part.inputs = list(_different(_wholes(own_inputs.get(index, []))))
-            part.outputs = list(_different(_wholes(own_outputs.get(index, []))))
-        for index, part in enumerate(self.parts):
+            part.inputs = list(_different(_wholes(own_inputs[index])))
+            part.outputs = list(_different(_wholes(own_outputs[index])))
             part.first_input, part.first_output = len(self._input_slots), len(self._output_slots)
             for place, variable in enumerate(part.inputs, part.first_input):
                 self._input_slots[index, *_key(variable)] = place
@@ -190,13 +190,13 @@ class Layout:
 
     def routes_into(self, part: int) -> Sequence[int]:
         """The routes that end at a component."""
-        return self._routes_by_target.get(part, ())
+        return self._routes_by_target.get(part, [])
 
     @cached_property
     def _routes_by_target(self) -> dict[int, list[int]]:
-        found: dict[int, list[int]] = {}
+        found = defaultdict(list)
         for index, route in enumerate(self.routes):
-            found.setdefault(route.target_part, []).append(index)
+            found[route.target_part].append(index)
         return found
 
     def routes_of(self, evaluation: Evaluation) -> tuple[int, ...]:
@@ -229,11 +229,11 @@ def _wholes(variables: Iterable[Variable]) -> Iterator[Variable]:
         yield from (variable if variable.array is None else variable.array).elements
 
 
-def _by_part(pairs: Iterable[tuple[int, Variable]]) -> dict[int, list[Variable]]:
-    """The variables of each component; those of the master itself have a negative number."""
-    found: dict[int, list[Variable]] = {}
+def _by_part(pairs: Iterable[tuple[int, Variable]]) -> defaultdict[int, list[Variable]]:
+    """The variables of each component."""
+    found = defaultdict(list)
     for index, variable in pairs:
-        found.setdefault(index, []).append(variable)
+        found[index].append(variable)
     return found
 
 

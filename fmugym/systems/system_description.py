@@ -77,14 +77,7 @@ class SystemDescription(ModelDescription):
 
     def what_drives(self, variable: Variable) -> str | None:
         """See ``ModelDescription.what_drives``."""
-        sources = {
-            f"{link.target}.{link.input}": f"{link.source}.{link.output}"
-            for link in self.plan.links
-        }
-        for connector in self.plan.connectors:
-            if connector.causality != "output":
-                ends = (f"{end.component}.{end.variable}" for end in connector.ends)
-                sources |= dict.fromkeys(ends, connector.name)
+        sources = {".".join(target): source for target, source in _sources(self.plan).items()}
         array = () if variable.array is None else (variable.array,)
         return next((sources[one.name] for one in (variable, *array) if one.name in sources), None)
 
@@ -206,8 +199,19 @@ def _variables(
             raise ConfigError(f"{name!r} is the name of two variables of {plan.name}")
         variables[connector.name] = variable
         elements |= names
-        ends += zip(*map(_elements_behind, behind), strict=True)
+        each = ([replace(end, variable=v) for v in end.variable.elements] for end in behind)
+        ends += zip(*each, strict=True)
     return variables, tuple(ends)
+
+
+def _sources(plan: SystemPlan) -> dict[tuple[str, str], str]:
+    """The outputs and names of the system that set variables, by component and variable."""
+    sources = {(one.target, one.input): f"{one.source}.{one.output}" for one in plan.links}
+    for connector in plan.connectors:
+        if connector.causality != "output":
+            ends = ((end.component, end.variable) for end in connector.ends)
+            sources |= dict.fromkeys(ends, connector.name)
+    return sources
 
 
 def _driven(
@@ -218,12 +222,8 @@ def _driven(
     Returns:
         The names of scalars and elements by component.
     """
-    ends = [(link.target, link.input) for link in plan.links]
-    for connector in plan.connectors:
-        if connector.causality != "output":
-            ends += [(end.component, end.variable) for end in connector.ends]
     driven: dict[str, set[str]] = {name: set() for name in numbers}
-    for component, variable in ends:
+    for component, variable in _sources(plan):
         part = parts[numbers[component]]
         driven[component].update(one.name for one in part.variable(variable).elements)
     return driven
@@ -294,10 +294,6 @@ def _behind(
     if found.array is not None:
         variable = variable.elements[found.place]
     return PartVariable(part, variable, end.gain, end.offset, is_target)
-
-
-def _elements_behind(end: PartVariable) -> list[PartVariable]:
-    return [replace(end, variable=element) for element in end.variable.elements]
 
 
 def _connector_variable(connector: Connector, first: PartVariable, reference: int) -> Variable:

@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
-from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMULoadError
 from fmugym.systems.system_description import describe_system
@@ -41,9 +40,9 @@ class SystemFMU(FMU):
     ) -> None:
         self.plan = plan
         self._opened = tuple(_opened(plan.components))
-        description = describe_system(plan, [fmu.description for fmu in self._opened])
-        path = Path(plan.name) if plan.file is None else plan.file
-        LoadableFMU.__init__(self, path, description, ())
+        self.path = Path(plan.name) if plan.file is None else plan.file
+        self.description = describe_system(plan, [fmu.description for fmu in self._opened])
+        self.preload = ()
         self.limits, self.interface = ArchiveLimits(), None
         self.probe_timeout = probe_timeout
         self.findings = plan.findings
@@ -66,11 +65,9 @@ class SystemFMU(FMU):
         """Whether all FMUs come with the package."""
         return all(fmu.bundled for fmu in self._opened)
 
-    @property
-    def parts(self) -> tuple[LoadableFMU, ...]:
-        """The FMUs of the components, extracted."""
-        folder = self.extract()
-        return tuple(fmu.again(folder / str(n)) for n, fmu in enumerate(self._opened))
+    def parts_in(self, folder: Path) -> list[tuple[FMU, Path]]:
+        """The FMUs of the components, and where each is in a folder like ``extract``'s."""
+        return [(fmu, folder / str(number)) for number, fmu in enumerate(self._opened)]
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:
@@ -127,9 +124,8 @@ class SystemFMU(FMU):
 
     def _extract_to(self, folder: Path, only: str = "") -> None:
         """Extract each FMU into a folder of its own."""
-        for number, (component, fmu) in enumerate(self._pairs()):
+        for component, (fmu, own) in zip(self.plan.components, self.parts_in(folder), strict=True):
             with _naming(component):
-                own = folder / str(number)
                 own.mkdir()
                 fmu._extract_to(own, only)
 

@@ -164,7 +164,9 @@ class Wiring:
         self._claim(name, causality, connection)
         ends = self._ends.setdefault(name, [])
         first = self._first(ends)
-        conversion = self._own_conversion(name, connection, first or target, target)
+        own, definitions = self._own_unit(name, first or target)
+        units = self._units(target)
+        conversion = _conversion(connection, own, definitions, target.variable.unit, units)
         if first is None:
             _check_gain(connection, target, target)
         else:
@@ -176,14 +178,6 @@ class Wiring:
             return None
         component = self.components[ends[0].component]
         return Port(component, component.variable(ends[0].variable))
-
-    def _own_conversion(
-        self, name: str, connection: Connection, first: Port, target: Port
-    ) -> Conversion:
-        """From the unit of an input of the system to that of a variable behind it."""
-        own, definitions = self._own_unit(name, first)
-        units = self._units(target)
-        return _conversion(connection, own, definitions, target.variable.unit, units)
 
     def _own_unit(self, name: str, port: Port) -> tuple[str | None, Mapping[str, Unit]]:
         """The unit of a name of the system, by default that of a variable behind it."""

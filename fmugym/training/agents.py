@@ -34,6 +34,7 @@ __all__ = [
     "names_of",
     "policy_with",
     "read_agent",
+    "read_facts",
     "save",
 ]
 
@@ -187,11 +188,26 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
 
 
 def _facts_in(folder: Path) -> dict[str, Any]:
+    return read_facts(folder, FACTS, "is no folder of 'fmugym train'", "algorithm")
+
+
+def read_facts(folder: Path, name: str, what_is_wrong: str, *needed: str) -> dict[str, Any]:
+    """Read a file of facts.
+
+    Args:
+        folder: Where it is.
+        name: Its name.
+        what_is_wrong: What the error says of the folder.
+        needed: The facts that must be there.
+
+    Raises:
+        ConfigError: If there is no such file, or it lacks one of them.
+    """
     try:
-        facts: dict[str, Any] = json.loads((folder / FACTS).read_text(encoding="utf-8"))
-        return {"algorithm": facts["algorithm"], **facts}
+        facts = json.loads((folder / name).read_text(encoding="utf-8"))
+        return {**{one: facts[one] for one in needed}, **facts}
     except ordinary(OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
+        raise ConfigError(f"{shown(str(folder))} {what_is_wrong}") from None
 
 
 def _normalization_in(folder: Path) -> Any:

@@ -19,13 +19,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import ConfigError, FMUGymError, reading, shown
-from fmugym.signals import ordinary
-from fmugym.training.agents import algorithm_of
+from fmugym.errors import FMUGymError, reading, shown
+from fmugym.training.agents import algorithm_of, read_facts
 
-__all__ = ["CHECKPOINT", "latest_checkpoint", "load_checkpoint", "save_checkpoint"]
+__all__ = [
+    "CHECKPOINT",
+    "NOTHING_TO_RESUME",
+    "latest_checkpoint",
+    "load_checkpoint",
+    "save_checkpoint",
+]
 
 CHECKPOINT: Final = "checkpoint.json"
+NOTHING_TO_RESUME: Final = "has no training to resume"
 _OF_NORMALIZATION: Final = ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward")
 _OF_MONITOR: Final = ("episode_returns", "episode_lengths", "episode_count")
 
@@ -96,11 +102,8 @@ def latest_checkpoint(folder: Path) -> tuple[Path, int]:
     Raises:
         ConfigError: If there is none.
     """
-    try:
-        facts = json.loads((folder / CHECKPOINT).read_text(encoding="utf-8"))
-        return folder / str(facts["folder"]), int(facts["steps"])
-    except ordinary(OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
+    facts = read_facts(folder, CHECKPOINT, NOTHING_TO_RESUME, "folder", "steps")
+    return folder / facts["folder"], facts["steps"]
 
 
 def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[str, Any], bool]:

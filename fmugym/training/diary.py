@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from fmugym.checks import check_option, number_of
+from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
@@ -60,11 +60,9 @@ class Diary:
         if facts is None:
             return None
         try:
-            variables = tuple(map(str, facts["variables"]))
-            environments = tuple(map(int, facts["environments"]))
-            every = None if facts["every"] is None else number_of("every", facts["every"])
-            return cls(variables, environments, every, str(facts["format"]))
-        except (KeyError, TypeError, ValueError) as error:
+            lists = {name: tuple(facts[name]) for name in ("variables", "environments")}
+            return cls(**{**facts, **lists})
+        except (KeyError, TypeError) as error:
             raise ConfigError(f"the facts of the recording are damaged: {error}") from None
 
     def facts(self) -> dict[str, Any]:
@@ -102,9 +100,16 @@ class Diary:
         return wrap
 
 
-def note(folder: Path, names: Sequence[str], row: Sequence[float]) -> None:
-    """Add a row to ``evaluations.csv``, whose first columns are steps and mean reward."""
-    path = folder / EVALUATIONS
+def note(folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVALUATIONS) -> None:
+    """Add a row to a table of a training, which is made if there is none.
+
+    Args:
+        folder: That of the training.
+        names: Those of the columns; in ``evaluations.csv`` steps and mean reward are the first.
+        row: The values.
+        name: That of the file.
+    """
+    path = folder / name
     is_new = not path.exists()
     with path.open("a", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

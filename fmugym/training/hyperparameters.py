@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import inspect
 import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
 from fmugym.training.agents import algorithm_of
+from fmugym.training.diary import note
 from fmugym.training.training import TRIALS, TrainingSettings, Watch, require_new, train
 
 __all__ = ["tune"]
@@ -66,9 +67,14 @@ def tune(
         sampler=optuna.samplers.TPESampler(seed=settings.seed),
         pruner=optuna.pruners.MedianPruner(n_startup_trials=3),
     )
-    objective = _Objective(settings, steps, optuna.TrialPruned)
-    note = _Notes(settings, tell)
-    study.optimize(objective, n_trials=trials, callbacks=[note], catch=(FMUGymError, ValueError))
+    objective = partial(_best_reward, settings, steps, optuna.TrialPruned)
+
+    def tell_of(_: Any, trial: Any) -> None:
+        _note(settings, trial)
+        reward = "" if trial.value is None else f", reward {trial.value:.6g}"
+        tell(f"trial {trial.number}: {trial.state.name.lower()}{reward}")
+
+    study.optimize(objective, n_trials=trials, callbacks=[tell_of], catch=(FMUGymError, ValueError))
     complete = [trial for trial in study.trials if trial.value is not None]
     if not complete:
         raise ConfigError(f"none of {trials} trials has come to its end; see trials.csv")
@@ -76,30 +82,24 @@ def tune(
     return dict(best.user_attrs["arguments"])
 
 
-class _Objective:
-    """A trial: returns the mean reward of its best evaluation."""
+def _best_reward(
+    settings: TrainingSettings, steps: int, pruned: type[Exception], trial: Any
+) -> float:
+    """Make a trial; returns the mean reward of its best evaluation."""
+    arguments = {**_suggested(trial, settings, steps), **(settings.arguments or {})}
+    trial.set_user_attr("arguments", arguments)
+    rewards: list[float] = []
 
-    def __init__(self, settings: TrainingSettings, steps: int, pruned: type[Exception]) -> None:
-        self._settings, self._steps, self._pruned = settings, steps, pruned
+    def evaluated(_: int, mean: float) -> None:
+        rewards.append(mean)
+        trial.report(mean, len(rewards))
+        if trial.should_prune():
+            raise pruned
 
-    def __call__(self, trial: Any) -> float:
-        given = dict(self._settings.arguments or {})
-        arguments = {**_suggested(trial, self._settings, self._steps), **given}
-        trial.set_user_attr("arguments", arguments)
-        rewards: list[float] = []
-
-        def evaluated(steps: int, mean: float) -> None:
-            rewards.append(mean)
-            trial.report(mean, len(rewards))
-            if trial.should_prune():
-                raise self._pruned
-
-        folder = self._settings.folder / TRIALS / f"{trial.number:03}"
-        settings = replace(
-            self._settings, folder=folder, steps=self._steps, arguments=arguments, diary=None
-        )
-        train(settings, watch=Watch(evaluated=evaluated))
-        return max(rewards)
+    folder = settings.folder / TRIALS / f"{trial.number:03}"
+    own = replace(settings, folder=folder, steps=steps, arguments=arguments, diary=None)
+    train(own, watch=Watch(evaluated=evaluated))
+    return max(rewards)
 
 
 def _suggested(trial: Any, settings: TrainingSettings, steps: int) -> dict[str, Any]:
@@ -141,22 +141,9 @@ def _most(name: str, settings: TrainingSettings, steps: int) -> int:
     return 1 << max(3, most.bit_length() - 1)  # so that batches divide what was collected
 
 
-class _Notes:
-    """Writes a line for each trial."""
-
-    def __init__(self, settings: TrainingSettings, tell: Callable[[str], None]) -> None:
-        self._path, self._tell = settings.folder / f"{TRIALS}.csv", tell
-
-    def __call__(self, study: Any, trial: Any) -> None:
-        state = trial.state.name.lower()
-        arguments = json.dumps(trial.user_attrs.get("arguments", {}))
-        row = [trial.number, state, trial.value, arguments]
-        is_new = not self._path.exists()
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        with self._path.open("a", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            if is_new:
-                writer.writerow(["trial", "state", "reward", "arguments"])
-            writer.writerow(row)
-        reward = "" if trial.value is None else f", reward {trial.value:.6g}"
-        self._tell(f"trial {trial.number}: {state}{reward}")
+def _note(settings: TrainingSettings, trial: Any) -> None:
+    """Write a line about a trial."""
+    arguments = json.dumps(trial.user_attrs.get("arguments", {}))
+    row = [trial.number, trial.state.name.lower(), trial.value, arguments]
+    settings.folder.mkdir(parents=True, exist_ok=True)
+    note(settings.folder, ("trial", "state", "reward", "arguments"), row, f"{TRIALS}.csv")

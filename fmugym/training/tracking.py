@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -14,28 +14,21 @@ from fmugym.extras import imported
 __all__ = ["TRACKERS", "Tracker", "tracker_for"]
 
 
-class Tracker:
+class Tracker(NamedTuple):
     """Takes the numbers of a training.
 
-    Args:
-        log: Takes numbers by name, and the step.
-        end: Is called at the end.
+    Attributes:
+        take: Takes numbers by name, and the step.
+        close: Is called at the end.
     """
 
-    def __init__(
-        self, log: Callable[[Mapping[str, float], int], None], end: Callable[[], None]
-    ) -> None:
-        self._log, self._end = log, end
+    take: Callable[[Mapping[str, float], int], None]
+    close: Callable[[], None]
 
     def log(self, numbers: Mapping[str, Any], step: int) -> None:
         """Log what is a number, of Python or of numpy."""
         kept = {n: float(v) for n, v in numbers.items() if isinstance(v, int | float | np.number)}
-        self._log(kept, step)
-
-    def close(self) -> None:
-        """End the log; more than one call is fine."""
-        end, self._end = self._end, lambda: None
-        end()
+        self.take(kept, step)
 
 
 def tracker_for(kind: str, facts: Mapping[str, Any], folder: Path) -> Callable[[], Tracker]:

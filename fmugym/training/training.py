@@ -37,9 +37,15 @@ from fmugym.training.agents import (
     imported_for_training,
     names_of,
     policy_with,
+    read_facts,
     save,
 )
-from fmugym.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from fmugym.training.checkpoints import (
+    NOTHING_TO_RESUME,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, note
 from fmugym.training.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
@@ -145,11 +151,7 @@ class Watch:
 
 
 def train(
-    settings: TrainingSettings,
-    tell: Callable[[str], None] = lambda line: None,
-    *,
-    resume: bool = False,
-    watch: Watch | None = None,
+    settings: TrainingSettings, *, resume: bool = False, watch: Watch = Watch()
 ) -> list[Score]:
     """Train an agent, and evaluate it on the way. The best one is kept.
 
@@ -158,11 +160,10 @@ def train(
 
     Args:
         settings: What to train.
-        tell: Gets a line of text for each evaluation.
         resume: Whether to go on with the training in the folder. If the FMU's state can be saved or
             its steps repeated, all takes the same course as without the interruption, to the last
             bit.
-        watch: Who is told of the training, in the place of ``tell``.
+        watch: Who is told of the training.
 
     Returns:
         The scores of the agent that is kept.
@@ -185,7 +186,7 @@ def train(
             venv = sb3.ScaledActions(venv)
         if settings.normalize:
             venv = _normalized(venv)
-        with closing(_Training(settings, venv, watch or Watch(tell), resume)) as training:
+        with closing(_Training(settings, venv, watch, resume)) as training:
             training.run()
             return training.scores_of_kept()
     finally:
@@ -243,11 +244,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
     Raises:
         ConfigError: If there is none.
     """
-    try:
-        facts: dict[str, Any] = json.loads((folder / TRAINING).read_text(encoding="utf-8"))
-        return {"steps": facts["steps"], **facts}
-    except ordinary(OSError, ValueError, KeyError, TypeError):
-        raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
+    return read_facts(folder, TRAINING, NOTHING_TO_RESUME, "steps")
 
 
 def _require_same(settings: TrainingSettings) -> None:
@@ -484,7 +481,7 @@ def _writer_to(tracker: Tracker, base: Any) -> Any:
     """What writes the log of Stable-Baselines3 to a tracker; it must be one of its own classes."""
     methods = {
         "write": lambda self, values, excluded, step=0: tracker.log(values, step),
-        "close": lambda self: tracker.close(),
+        "close": lambda self: None,
     }
     return type("Writer", (base,), methods)()
 

@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fmugym.archive.loadable import LoadableFMU
+from fmugym.archive.fmu import FMU
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.process.library_data import library_data
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -182,11 +182,11 @@ def _step(pool: Pool, spec: PoolSpec) -> float:
     return max(0.0, fastest - idle)
 
 
-def _need(written: set[Path], fmu: LoadableFMU) -> Neighbours:
+def _need(written: set[Path], fmu: FMU) -> Neighbours:
     """A copy has data of its own, but the loader gives all copies the same dependencies."""
     if not written:
         return Neighbours.INDEPENDENT
-    own = {part.extract().resolve() / part.library for part in fmu.parts or (fmu,)}
+    own = {library for _, library in fmu.libraries_in(fmu.extract().resolve())}
     return Neighbours.LIBRARIES if written <= own else Neighbours.ONE_THREAD
 
 

@@ -120,7 +120,8 @@ class Rehearsal:
         self.step_seconds = math.inf
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs), 2))
         self._references: list[_Run] = []
-        self._tolerances, self._knows_noise = np.full(len(spec.outputs), _tolerance_of(spec)), False
+        tolerance = _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)  # of the largest magnitude
+        self._tolerances, self._knows_noise = np.full(len(spec.outputs), tolerance), False
 
     @property
     def possible(self) -> bool:
@@ -369,11 +370,6 @@ class Rehearsal:
 
 def _same(one: _Run, other: _Run) -> bool:
     return one.rows.tobytes() == other.rows.tobytes() and one.status == other.status
-
-
-def _tolerance_of(spec: PoolSpec) -> float:
-    """By how much two runs of a solver may differ, as a fraction of the largest magnitude."""
-    return _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)
 
 
 def _difference(one: FloatArray, other: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ from combinations import in_turn
 from fmu_tools import HERE, edited_fmu, library_name, probe_config, read_fmu
 
 from fmugym import FMU, FMULoadError, bundled_fmu
-from fmugym.archive import loadable
+from fmugym.archive import fmu as fmus
 from fmugym.archive.dependencies import missing_libraries
 from fmugym.archive.executable import check_library
 
@@ -227,7 +227,7 @@ def test_paths_of_preload_are_relative_to_the_class(probe, tmp_path, monkeypatch
     from preloading_tank import Tank
 
     loaded = []
-    monkeypatch.setattr(loadable, "load_globally", loaded.append)
+    monkeypatch.setattr(fmus, "load_globally", loaded.append)
     config = probe_config(preload=["lib/libgave.so", "libm.so.6"])
     Tank(probe(), config).close()
     assert loaded == [str(tmp_path / "lib" / "libgave.so"), "libm.so.6"]

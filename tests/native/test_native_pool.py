@@ -361,7 +361,7 @@ class TestIsolation:
         def full(*_):
             raise OSError("no space left on device")
 
-        monkeypatch.setattr("fmugym.archive.loadable.shutil.copytree", full)
+        monkeypatch.setattr("fmugym.archive.fmu.shutil.copytree", full)
         with pytest.raises(FMULoadError, match=r"needs a copy for each instance.*no space left"):
             native(shared, ["work"], ["total"], 3, private_libraries=True)
 

@@ -67,7 +67,7 @@ def pools_of(request, tmp_path, opened):
         if name == "wine":
             request.getfixturevalue("wine")
             monkeypatch = request.getfixturevalue("monkeypatch")
-            monkeypatch.setattr("fmugym.archive.loadable.is_bundled", is_bundled_or_copy)
+            monkeypatch.setattr("fmugym.archive.fmu.is_bundled", is_bundled_or_copy)
             path = for_windows(path, tmp_path)
         is_system = "system" in name
         options = OPTIONS[name] | {"reset_method": reset_method, "private_libraries": False}

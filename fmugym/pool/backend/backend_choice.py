@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-from fmugym.archive.fmu import FMU
-from fmugym.archive.loadable import copy_libraries
+from fmugym.archive.fmu import FMU, copy_libraries
 from fmugym.errors import ConfigError, FMULoadError, unknown_name
 from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.by_fmpy import FMPyInstance
@@ -79,7 +78,7 @@ def _fmpy_pool(
 
     def instances(count: int) -> list[FMPyInstance]:
         fmu.prepare_libraries()
-        libraries = copy_libraries(fmu, fmu.extract(), count)
+        libraries = copy_libraries(fmu, count)
         return [FMPyInstance(fmu, spec, log, library) for library in libraries]
 
     return BackendPool(fmu, spec, num_instances, instances, is_real=False)
@@ -89,7 +88,7 @@ def _beyond_fmpy(fmu: FMU, spec: PoolSpec, wishes: Wishes) -> dict[str, bool]:
     """What only the engine can do, and whether it is needed."""
     about, variables = fmu.description, (*spec.inputs, *spec.outputs)
     return {
-        "a system": bool(fmu.parts),
+        "a system": bool(about.components),
         "model exchange": about.interface != "co_simulation",
         "clocks and event mode": about.uses_event_mode,
         "libraries for Windows": fmu.in_wine,

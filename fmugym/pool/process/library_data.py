@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fmugym.archive.elf import opened
-from fmugym.archive.loadable import LoadableFMU
+from fmugym.archive.fmu import FMU
 from fmugym.signals import ordinary
 
 __all__ = ["library_data"]
@@ -36,7 +36,7 @@ class _Place(NamedTuple):
     size: int
 
 
-def library_data(fmu: LoadableFMU, process: int) -> dict[_Place, int]:
+def library_data(fmu: FMU, process: int) -> dict[_Place, int]:
     """The checksums of the writable data of the libraries that an FMU has brought along.
 
     Args:
@@ -58,12 +58,11 @@ def library_data(fmu: LoadableFMU, process: int) -> dict[_Place, int]:
         return {}
 
 
-def _places(fmu: LoadableFMU, process: int) -> Iterator[_Place]:
+def _places(fmu: FMU, process: int) -> Iterator[_Place]:
     """The writable data of the libraries that the FMU has brought along and loaded."""
-    folders = [part.extract().resolve() for part in fmu.parts or (fmu,)]
+    folder = fmu.extract().resolve()
     for library, base in _loaded_libraries(process).items():
-        ours = any(library.is_relative_to(folder) for folder in folders)
-        if ours and not library.name.startswith(_RUNTIMES):
+        if library.is_relative_to(folder) and not library.name.startswith(_RUNTIMES):
             with opened(library) as elf:
                 for address, size in elf.writable:
                     yield _Place(library, base + address, size)

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import FMU
-from fmugym.archive.loadable import copy_libraries
+from fmugym.archive.fmu import FMU, copy_libraries
 from fmugym.errors import FMULoadError
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.form import Files, Writer, form_of_pool
@@ -42,7 +41,7 @@ class Setup:
         fmu: The FMU.
         folder: Where it was extracted to.
         files: Where its files are.
-        before: The libraries to load before its own; see ``LoadableFMU.libraries_before``.
+        before: The libraries to load before its own; see ``FMU.libraries_before``.
         spec: What to do at each reset and step.
         num_instances: N, the instances of all workers together.
         logs_all: Whether FMUs are asked to log everything.
@@ -93,7 +92,7 @@ class Setup:
         The options are those attributes that have a default.
         """
         folder = fmu.extract()
-        copies = copy_libraries(fmu, folder, num_instances) if private_libraries else None
+        copies = copy_libraries(fmu, num_instances) if private_libraries else None
         return cls(
             fmu=fmu,
             folder=folder,

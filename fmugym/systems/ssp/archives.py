@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import posixpath
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -18,7 +18,6 @@ from fmugym.archive.temporary import folder_name, make_folder
 from fmugym.checks import check_path
 from fmugym.errors import FMUGymError, FMULoadError, shown
 from fmugym.systems.components import Component
-from fmugym.systems.connections import Connection
 from fmugym.systems.ssp.elements import (
     SSD,
     Element,
@@ -83,12 +82,13 @@ class _Reader:
         flat = Flat(tree, units, lambda one: self._fmu(one).description, self.findings)
         connections = list(flat.connections())
         components = self._components(flat)
-        self.findings += [*ignored(root), *_unconnected(tree, connections)]
+        used = {end for one in connections for end in (one.source, one.target)}
+        self.findings += [*ignored(root), *_unconnected(tree, used)]
         return {
             "components": components,
             "connections": connections,
             "name": root.get("name") or tree.name,
-            "units": _own_units(flat, connections),
+            "units": _own_units(flat, used),
             "unit_definitions": units,
             "own_names": [name for name, _ in flat.connectors() if "." in name],
             "description": tree.description,
@@ -161,9 +161,8 @@ def _folder_of(archive: SafeZip) -> Path:
     return folder
 
 
-def _own_units(flat: Flat, connections: Sequence[Connection]) -> dict[str, str]:
+def _own_units(flat: Flat, used: Set[str]) -> dict[str, str]:
     """The units of the connectors of systems that connections use."""
-    used = {end for one in connections for end in (one.source, one.target)}
     return {
         name: connector.unit
         for name, connector in flat.connectors()
@@ -171,8 +170,7 @@ def _own_units(flat: Flat, connections: Sequence[Connection]) -> dict[str, str]:
     }
 
 
-def _unconnected(tree: SystemElement, connections: Sequence[Connection]) -> list[str]:
-    used = {end for one in connections for end in (one.source, one.target)}
+def _unconnected(tree: SystemElement, used: Set[str]) -> list[str]:
     return [
         f"the connector {shown(name)} of the system is not connected and is ignored"
         for name in tree.connectors

@@ -16,7 +16,6 @@ __all__ = [
     "FMU_TYPE",
     "OWN_ANNOTATION",
     "SSD",
-    "Binding",
     "Element",
     "OwnConnector",
     "SystemElement",
@@ -60,31 +59,16 @@ _MAPPINGS: Final = (
 
 
 @dataclass(frozen=True)
-class Binding:
-    """A parameter binding: the XML element, of which ``fmugym.systems.ssp.parameters`` reads more.
-
-    Attributes:
-        prefix: Put before all names of the source.
-        xml: The element.
-    """
-
-    prefix: str
-    xml: Any
-
-
-@dataclass(frozen=True)
 class OwnConnector:
     """A connector of an element.
 
     Attributes:
         kind: ``"input"``, ``"output"``, ``"parameter"`` or another of the standard's.
         unit: None where the file gives none.
-        description: For people.
     """
 
     kind: str
     unit: str | None
-    description: str = ""
 
     @property
     def gives(self) -> bool:
@@ -99,7 +83,8 @@ class Element:
     Attributes:
         name: In its system.
         connectors: By name.
-        bindings: The parameter bindings in their order.
+        bindings: The XML elements of the parameter bindings in their order, which
+            ``fmugym.systems.ssp.parameters`` reads.
         source: The URI of the FMU.
         interface: One of fmugym's; None for any.
         own: The attributes of an annotation for fmugym.
@@ -107,7 +92,7 @@ class Element:
 
     name: str
     connectors: dict[str, OwnConnector]
-    bindings: list[Binding]
+    bindings: list[Any]
     source: str = ""
     interface: str | None = None
     own: dict[str, str] = field(default_factory=dict)
@@ -145,7 +130,7 @@ class SystemElement:
 
     name: str
     connectors: dict[str, OwnConnector]
-    bindings: list[Binding]
+    bindings: list[Any]
     elements: dict[str, Element | SystemElement]
     wires: list[Wire]
     own: dict[str, str]
@@ -206,7 +191,7 @@ def read_system(xml: Any, findings: list[str]) -> SystemElement:
     return SystemElement(
         name=xml.get("name") or "system",
         connectors=_read_connectors(xml),
-        bindings=_read_bindings(xml),
+        bindings=list(children(xml, "ParameterBindings/ParameterBinding")),
         elements=elements,
         wires=[_read_wire(one) for one in children(xml, "Connections/Connection")],
         own=_read_own(xml),
@@ -247,7 +232,7 @@ def _read_component(xml: Any, findings: list[str]) -> Element:
     return Element(
         name=name,
         connectors=_read_connectors(xml),
-        bindings=_read_bindings(xml),
+        bindings=list(children(xml, "ParameterBindings/ParameterBinding")),
         source=xml.get("source") or "",
         interface=_INTERFACES.get(wanted),
         own=_read_own(xml),
@@ -260,14 +245,8 @@ def _read_connectors(xml: Any) -> dict[str, OwnConnector]:
         found_types = (next(children(one, name), None) for name in _REALS)
         real = next((element for element in found_types if element is not None), None)
         unit = None if real is None else unit_of(real)
-        kind, text = one.get("kind") or "", one.get("description") or ""
-        found[one.get("name") or ""] = OwnConnector(kind, unit, text)
+        found[one.get("name") or ""] = OwnConnector(one.get("kind") or "", unit)
     return found
-
-
-def _read_bindings(xml: Any) -> list[Binding]:
-    bindings = children(xml, "ParameterBindings/ParameterBinding")
-    return [Binding(one.get("prefix") or "", one) for one in bindings]
 
 
 def _read_wire(xml: Any) -> Wire:

@@ -11,7 +11,6 @@ from fmugym.archive.description import Unit
 from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.errors import FMULoadError, shown
 from fmugym.systems.ssp.elements import (
-    Binding,
     children,
     number_in,
     read_units,
@@ -56,29 +55,26 @@ class Setting:
     scaling: Conversion = IDENTITY
 
 
-def read_settings(
-    binding: Binding, read: Callable[[str], Any], findings: list[str]
-) -> Iterator[Setting]:
+def read_settings(xml: Any, read: Callable[[str], Any], findings: list[str]) -> Iterator[Setting]:
     """Read the values of a parameter binding.
 
     Args:
-        binding: The binding.
+        xml: The element of the binding.
         read: Returns the root of another XML file of the archive by its URI.
         findings: What is ignored is added here.
 
     Raises:
         FMULoadError: If a source or a transformation cannot be used.
     """
-    xml = binding.xml
     source = _content(xml, "ParameterValues/ParameterSet", read, _SET_TYPE)
     if source is None:
         findings.append(f"line {xml.sourceline}: a parameter binding has no values")
         return
-    units = read_units(source)
+    units, prefix = read_units(source), xml.get("prefix") or ""
     settings = [
         setting
         for one in children(source, "Parameters/Parameter")
-        if (setting := _setting(one, binding.prefix, units, findings))
+        if (setting := _setting(one, prefix, units, findings))
     ]
     mapping = next(children(xml, "ParameterMapping"), None)
     if mapping is None:
