@@ -95,7 +95,7 @@ class Uniform(KnownArguments):
 
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value."""
-        return float(rng.uniform(self.low, self.high))
+        return self.low + (self.high - self.low) * rng.random()
 
     def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
         return Recipe("uniform", (self.low, self.high - self.low), (self.low, self.high))
@@ -349,7 +349,7 @@ def as_distribution(what: str, value: Any) -> Any:
 
 def is_distribution(value: object) -> bool:
     """Whether a value of a config is to be drawn anew at each reset."""
-    if value is None or isinstance(value, (float, type)):  # quickly: `time` asks it
+    if value is None or isinstance(value, (float, str, type)):  # quickly: `time` asks it
         return False
     return isinstance(value, _OURS) or has_method(value, "sample") or has_method(value, "rvs")
 

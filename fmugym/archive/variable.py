@@ -147,7 +147,7 @@ class Variable:
     bounds: tuple[float, float] | None = None
     sampling: str = "last"
 
-    @property
+    @cached_property
     def kind(self) -> str:
         """One of real, integer, boolean, enumeration, string and binary.
 

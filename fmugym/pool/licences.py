@@ -11,10 +11,9 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.base import Pool
 from fmugym.pool.bundle import IndexArray
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "require_licence",
     "require_started",
     "speaks_of_licence",
-    "start_instances",
 ]
 
 R = TypeVar("R")
@@ -98,32 +96,6 @@ def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:
         failure = f"{doing}{pool.failure(index)}"
         error = LicenceError if speaks_of_licence(failure) else SimulationError
         raise error(failure if pool.num_instances == 1 else f"environment {index}: {failure}")
-
-
-def start_instances(
-    pool: Pool,
-    variables: tuple[Variable, ...],
-    values: FloatArray,
-    indices: IndexArray,
-) -> None:
-    """Reset instances for new episodes.
-
-    Args:
-        pool: Has the instances.
-        variables: The start variables.
-        values: Their values, shape (P, N).
-        indices: The instances, shape (M,).
-
-    Raises:
-        SimulationError: If one fails, see ``require_started``.
-    """
-    mask = None
-    if len(indices) < pool.num_instances:
-        mask = np.zeros(pool.num_instances, np.bool_)
-        mask[indices] = True
-    _, statuses = pool.reset(variables, values, mask)
-    if np.count_nonzero(statuses):
-        require_started(pool, indices)
 
 
 class LicenceWait:

@@ -11,9 +11,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.pool.base import FloatArray
+from fmugym.pool import Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.licences import start_instances
+from fmugym.pool.licences import require_started
 from fmugym.task.episode import Episode, EpisodeDraws
 from fmugym.task.readings import Readings
 
@@ -29,21 +29,15 @@ class Beginning(ABC):
     Args:
         env: The environment, or the prototype of N.
         draws: What the values were drawn from.
+        episode: These values; of N environments, rows.
         indices: The environments, shape (M,).
-        values: The start values in the order of the draws, shape (P, N).
-        parameters: The same by name: numbers, or rows of shape (N,).
     """
 
     def __init__(
-        self,
-        env: Any,
-        draws: EpisodeDraws,
-        indices: IndexArray,
-        values: FloatArray,
-        parameters: Mapping[str, Any],
+        self, env: Any, draws: EpisodeDraws, episode: Episode, indices: IndexArray = FIRST
     ) -> None:
-        self.env, self.draws, self.indices = env, draws, indices
-        self.values, self.parameters, self.pool = values, parameters, env.inside.pool
+        self.env, self.draws, self.episode, self.indices = env, draws, episode, indices
+        self.pool: Pool = env.inside.pool
 
     def begin(self) -> None:
         """Start the FMUs, and let hooks read what episodes begin with.
@@ -54,10 +48,10 @@ class Beginning(ABC):
         """
         warm_ups = self.env.inside.warm_ups
         if warm_ups is None:
-            start_instances(self.pool, self.draws.model_variables, self.values, self.indices)
-            self.forget()
+            self._start(self.indices)
+            self._forget()
         else:
-            self.forget()
+            self._forget()
             warm_ups.begin(self)
         self.look()
 
@@ -67,13 +61,22 @@ class Beginning(ABC):
         Returns:
             What their hooks read, environments on the last axis.
         """
-        start_instances(self.pool, self.draws.model_variables, self.values, indices)
+        self._start(indices)
         self.look()
         return self.readings(indices)
 
-    def forget(self) -> None:
+    def _start(self, indices: IndexArray) -> None:
+        pool, mask = self.pool, None
+        if len(indices) < pool.num_instances:
+            mask = np.zeros(pool.num_instances, np.bool_)
+            mask[indices] = True
+        pool.reset(self.draws.model_variables, self.episode.start_values, mask)
+        if any(pool.statuses.tolist()):
+            require_started(pool, indices)
+
+    def _forget(self) -> None:
         """Let hooks read nothing of earlier episodes, but for the outputs."""
-        inside, given = self.env.inside, self.parameters.get
+        inside, given = self.env.inside, self.episode.parameters.get
         self.clear([given(name, start) for name, start in inside.start_inputs], inside.no_action)
 
     @abstractmethod
@@ -103,59 +106,45 @@ class Beginning(ABC):
 
 
 class BeginningOfOne(Beginning):
-    """An episode of a single environment that begins.
-
-    Args:
-        env: The environment.
-        draws: What the values were drawn from.
-        episode: These values.
-    """
-
-    def __init__(self, env: Any, draws: EpisodeDraws, episode: Episode) -> None:
-        super().__init__(env, draws, FIRST, episode.start_values, episode.parameters)
-        self._variables = episode.variables
-        self._read: Readings = env.inside.readings
-
-    def forget(self) -> None:
-        """See ``Beginning.forget``."""
-        inside = self.env.inside
-        if inside.player is not None:
-            inside.player.begin(inside)
-        self._read = read = inside.readings
-        read.parameters = self.parameters
-        if self._variables:
-            read.variables.update(self._variables)
-        inside.pictured = None, 0.0
-        super().forget()
+    """An episode of a single environment that begins."""
 
     def clear(self, inputs: list[Any], action: Any) -> None:
         """See ``Beginning.clear``."""
-        read = self._read
+        inside, episode = self.env.inside, self.episode
+        if inside.player is not None:
+            inside.player.begin(inside)
+        read = inside.readings
+        read.parameters = episode.parameters
+        if episode.variables:
+            read.variables.update(episode.variables)
+        inside.pictured = None, 0.0
         read.inputs, read.step_count = tuple(inputs), 0
         read.action = read.previous_action = action
         read.done = read.after_end = False
 
     def look(self) -> None:
         """See ``Beginning.look``."""
-        inside, read = self.env.inside, self._read
+        inside = self.env.inside
+        read = inside.readings
         read.values = tuple(inside.output_row.tolist())
         read.state = read.previous_state = read.values[: inside.output_count]
 
     def readings(self, indices: IndexArray) -> Readings:
         """See ``Beginning.readings``."""
-        read: Readings = self._read
+        read: Readings = self.env.inside.readings
         return read.mapped(_as_row)
 
     def row(self, name: str) -> Any:
         """See ``Beginning.row``."""
-        return _as_row(self._read.variables[name])
+        return _as_row(self.env.inside.readings.variables[name])
 
     def place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
         """See ``Beginning.place``; the warm-up has left inputs, too."""
+        read = self.env.inside.readings
         for name, row in values.items():
             part = row[..., 0]
-            self._read.variables[name] = part.item() if part.ndim == 0 else part
-        self._read.inputs = tuple(self.env.inside.input_row.tolist())
+            read.variables[name] = part.item() if part.ndim == 0 else part
+        read.inputs = tuple(self.env.inside.input_row.tolist())
 
 
 def _as_row(value: Any) -> Any:

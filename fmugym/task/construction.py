@@ -267,10 +267,10 @@ def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> Episo
     interface = env.inside.interface
     given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
     own = interface.start_values(given)
-    parameters = {**interface.parameters, **own}
+    given_variables = {name: interface.parameter(name, value) for name, value in own.items()}
     return EpisodeDraws(
-        tuple(map(interface.parameter, parameters, parameters.values())),
-        parameters,
+        tuple((interface.parameter_variables | given_variables).values()),
+        {**interface.parameters, **own},
         env.config.episode_variables,
         own.keys(),
     )

@@ -37,10 +37,10 @@ class Draw(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """The values of one episode.
+    """The values of one episode, or rows of those of N.
 
     Attributes:
-        start_values: The parameters in their order, shape (P, 1).
+        start_values: The parameters in their order, shape (P, 1) or (P, N).
         parameters: The parameters by name.
         variables: The episode variables by name.
         drawn: The parameters and variables that were drawn or overridden, by name.
@@ -84,14 +84,17 @@ class EpisodeDraws:
         self.model_variables = model_variables
         self._parameters = ParameterValues(parameters)
         self._variables = dict(episode_variables)
-        pairs = zip(model_variables, parameters.values(), strict=True)
-        self.constants = np.array([_constant(v, value) for v, value in pairs], np.float64)
         self.told = {name: parameters[name] for name in overridden}
         self._random_parameters = {
             name: index
             for index, (name, value) in enumerate(parameters.items())
             if is_distribution(value)
         }
+        constants = [
+            _constant(variable, None if name in self._random_parameters else value)
+            for variable, (name, value) in zip(model_variables, parameters.items(), strict=True)
+        ]
+        self.constants = np.array(constants, np.float64)
         strings = (v.name for v in model_variables if v.kind == "string")
         self.strings = frozenset(strings)
         self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
@@ -218,7 +221,7 @@ class EpisodeDraws:
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
-        parameters, variables = self._parameters.copy(), self._variables.copy()
+        parameters, variables = ParameterValues(self._parameters), self._variables.copy()
         drawn: dict[str, Any] = {}
         if self._distributions:
             drawn = self.shown(self.draw_values(rng))
@@ -305,9 +308,10 @@ def is_drawn(value: Any) -> bool:
 
 
 def _constant(variable: Variable, value: Any) -> float:
-    if is_distribution(value):
-        return float(variable.items[0][1]) if variable.kind == "string" else 0.0
-    return number_of(value) if variable.kind == "string" else value
+    """The number of a parameter; any that is possible if it is drawn, which None stands for."""
+    if variable.kind == "string":
+        return variable.items[0][1] if value is None else number_of(value)
+    return 0.0 if value is None else value
 
 
 def _is_double(variable: Variable) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy.typing as npt
@@ -94,6 +95,11 @@ class Interface:
         if variable.kind != "string":
             return variable
         return with_texts(variable, (*texts_in(variable, value), *self.texts.get(name, ())))
+
+    @cached_property
+    def parameter_variables(self) -> dict[str, Variable]:
+        """The variables of ``parameters``, by the same names."""
+        return {name: self.parameter(name, value) for name, value in self.parameters.items()}
 
     def with_parameter(self, name: str, values: npt.NDArray[Any], index: int) -> Interface:
         """The same with another value of a parameter, whose values in N environments differ.

@@ -38,9 +38,11 @@ def within(variable: Variable, value: Any) -> Any:
     """
     if variable.kind not in {"real", "integer"}:
         return value
-    low, high = variable.bounds or _range_of_fmu(variable)
+    low, high = variable.bounds or variable.limits
     ends = support_of(value) if is_distribution(value) else (value, value)
     if _lies_in(low, ends[0], high) and _lies_in(low, ends[1], high):
+        return value
+    if variable.bounds is None and _limits_exclude_start(variable):
         return value
     unit = "" if variable.unit in (None, "", "1") else f" {variable.unit}"
     text = f"{low} and {high}{unit}, {_GIVEN if variable.bounds else _OF_FMU}"
@@ -55,14 +57,13 @@ def within(variable: Variable, value: Any) -> Any:
     return own
 
 
-def _range_of_fmu(variable: Variable) -> tuple[float, float]:
-    """The FMU's limits; none if they exclude its own start value, which they then cannot mean."""
+def _limits_exclude_start(variable: Variable) -> bool:
+    """Whether the FMU's limits exclude its own start value, so that they cannot be meant."""
     low, high = variable.limits
     try:
-        start = low if variable.start is None else variable.start_number
+        return variable.start is not None and not _lies_in(low, variable.start_number, high)
     except ConfigError:  # no number
-        start = low
-    return (low, high) if _lies_in(low, start, high) else (-math.inf, math.inf)
+        return False
 
 
 def _lies_in(low: float, value: float, high: float) -> bool:

@@ -151,7 +151,7 @@ class WarmUps:
         found = {}
         for index in indices:
             own = (np.float64(row[..., index]).tobytes() for row in rows)
-            parts = [names, beginning.values[:, index].tobytes(), *own]
+            parts = [names, beginning.episode.start_values[:, index].tobytes(), *own]
             key = self._key(parts)
             warmed = _memory.find(key) or self._read(key)
             if warmed is None:

@@ -27,7 +27,7 @@ from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.beginning import Beginning
 from fmugym.task.construction import draws_of, draws_of_reset
-from fmugym.task.episode import EpisodeDraws
+from fmugym.task.episode import Episode, EpisodeDraws
 from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
 from fmugym.task.native_draws import no_draws
@@ -362,7 +362,7 @@ class BatchEngine(Engine):
         self.has_moved = True
         rows = {name: self._parameters[name] for name in draws.parameter_names}
         values = np.array([*rows.values()]).reshape(len(rows), self._n)
-        _Beginning(self, draws, indices, values, rows).begin()
+        _Beginning(self, draws, Episode(values, rows, {}, {}), indices).begin()
 
     def _place_episodes(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
         """Write the values of episodes into the rows of the parameters and variables."""
@@ -818,18 +818,13 @@ class _Beginning(Beginning):
 
     Args:
         engine: Has the rows.
-        draws, indices, values, parameters: See ``Beginning``.
+        draws, episode, indices: See ``Beginning``.
     """
 
     def __init__(
-        self,
-        engine: BatchEngine,
-        draws: EpisodeDraws,
-        indices: IndexArray,
-        values: FloatArray,
-        parameters: Mapping[str, FloatArray],
+        self, engine: BatchEngine, draws: EpisodeDraws, episode: Episode, indices: IndexArray
     ) -> None:
-        super().__init__(engine.env, draws, indices, values, parameters)
+        super().__init__(engine.env, draws, episode, indices)
         self._engine = engine
 
     def clear(self, inputs: list[Any], action: Any) -> None:
