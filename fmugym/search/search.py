@@ -57,7 +57,7 @@ _BEST_PART: Final = 4
 """This part of the candidates tells what observations are like."""
 
 _FINEST: Final = 1e-3
-"""The smallest constants with which they look around, as a part of the largest ones."""
+"""The smallest constants by which they do so without a controller; the largest ones are 1."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
@@ -215,11 +215,12 @@ class Search:
         """What observations are like while candidates add constants to what agents decide.
 
         Only the best candidates count: policies that are worth something see the like, while others
-        may drive the process far away. In an unstable process, only small constants do not.
+        may drive the process far away. Without a controller, some constants are small: only these
+        keep an unstable process near.
         """
-        sizes = np.geomspace(1.0, _FINEST, _MANY)[:, None]
         seen: list[tuple[Merit, Any]] = []
         for text in (controller, None):
+            sizes = np.geomspace(1.0, _FINEST if text is None else 1.0, _MANY)[:, None]
             rows = history.extended(sizes * self._rng.uniform(-1, 1, (_MANY, history.acting)))
             seeds = self._training(self.episodes)
             outcome = arena.play(replace(history, text=text), rows, seeds, has_moments=True)
