@@ -422,15 +422,16 @@ import sys
 sys.path[:0] = {building.FOLDERS!r}
 import numpy as np
 import test_native_pool as t
+from zoo_tools import resident_bytes
 path = t.bundled_fmu({model!r}, {version!r})
 t.make(t.NativePool, path, {inputs!r}, {outputs!r}, 10).close()
-before = t.resident_bytes()
+before = resident_bytes()
 pool = t.make(t.NativePool, path, {inputs!r}, {outputs!r}, 20000)
 values = np.ones(({len(start)}, 20000))
 for _ in range(3):
     pool.reset(tuple(map(pool.variable, {start!r})), values)
 pool.step()
-print((t.resident_bytes() - before) / 20000)
+print((resident_bytes() - before) / 20000)
 """
     assert printed_number(script) < 8000
 
