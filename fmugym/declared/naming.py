@@ -80,6 +80,7 @@ class Naming:
         warm_steps: The steps of a warm-up with moving inputs.
 
     Attributes:
+        declared, time_step, warm_steps: As given.
         graph: Has everything that the task computes.
         outputs: The names of the values in ``state``, in their order.
         monitors: The names of other values that are read from the FMU.

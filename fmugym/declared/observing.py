@@ -232,8 +232,8 @@ class _Past:
         first = self._fresh(entry, variable, 0)
         is_first = naming.step_count == naming.first_step
         before = where(is_first, fill, naming.read("variables", kept, 0))
-        past = first, before, naming.step_count, naming.channel_of(name), naming.time_step
-        now = variable.device.following(*past)
+        step_count, channel = naming.step_count, naming.channel_of(name)
+        now = variable.device.following(first, before, step_count, channel, naming.time_step)
         self._measured[name] = History(name, kept, length, now, fill, first)
         return kept
 

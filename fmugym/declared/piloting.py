@@ -55,6 +55,11 @@ class Pilot:
         naming: Gives names their values.
         variable: The variable that the controller writes.
         controller: Chooses the value, in the unit of the task.
+
+    Attributes:
+        variable, controller: As given.
+        place: The place of its action.
+        values: What it measures.
     """
 
     def __init__(self, naming: Naming, variable: TaskVariable, controller: Controller) -> None:

@@ -28,24 +28,25 @@ _CONTROLLER: Final = "agent.controller"
 _Ask = Callable[[Any], Any]
 
 
-def _decided_by_network(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
+def _decided_by_any(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
     return ask(seen), ()
 
 
 @dataclass(frozen=True)
 class Decision:
-    """How an agent decides; by default as any network alone.
+    """How an agent decides; by default any action may follow from the observation.
 
     Attributes:
         network: Its network; None for none.
         decide: Takes the observation, symbols of shape (k, N), what the agent remembers, and a
-            function that asks the network. Returns the elements of the action, environments last,
-            and what the agent remembers then.
+            function that asks the network for its last values, or for any action if there is none.
+            Returns the elements of the action, environments last, and what the agent remembers
+            then.
         starts: What it remembers at the beginning of an episode, by name.
     """
 
     network: Network | None = None
-    decide: Callable[[Any, Sequence[Any], _Ask], tuple[Any, Sequence[Any]]] = _decided_by_network
+    decide: Callable[[Any, Sequence[Any], _Ask], tuple[Any, Sequence[Any]]] = _decided_by_any
     starts: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 

@@ -129,7 +129,7 @@ def logic_of(
     Args:
         env: The environment. It is not stepped. What its sensors and actuators do is left out; see
             ``without_imperfections``.
-        decision: From the observation to the action; by default that of any network.
+        decision: From the observation to the action; by default any action may follow.
         all_inputs: Whether the controller also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
         external: The names of data that the controller is given as measurements, forecasts of
@@ -224,7 +224,10 @@ class _ControllerTracer(Tracer):
         return self._nodes(elements, shape, space.dtype), kept
 
     def _asked(self, features: Any) -> Any:
-        """The last values of the network for some features; what its first layer takes is noted."""
+        """The last values of the network for some features, or any action if there is no network.
+
+        What the first layer takes is noted.
+        """
         network, space = self._decision.network, self._env.action_space
         count, dtype = math.prod(space.shape or ()), np.dtype(space.dtype)
         if network is not None:

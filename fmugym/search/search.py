@@ -57,7 +57,7 @@ _BEST_PART: Final = 4
 """This part of the candidates tells what observations are like."""
 
 _FINEST: Final = 1e-3
-"""The smallest constants by which they do so without a controller; the largest ones are 1."""
+"""The smallest constants that candidates add without a controller; the largest ones are 1."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
