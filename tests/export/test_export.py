@@ -126,6 +126,30 @@ class Loops:
             assert worst <= 1e-5
         assert (len(began) > 1) == (times != "constant")
 
+    def test_of_choices_that_do_not_begin_with_0(self, tmp_path):
+        class Shifted(Filtered):
+            def _get_action_space(self):
+                return gymnasium.spaces.MultiDiscrete([3, 3], start=[2, -1])
+
+            def _get_inputs(self):
+                return self.GAINS[self.action[0] - 2] * self.action[1]
+
+        env = Shifted()
+        network = network_for(env)
+        agent = agent_of(env, network)
+        controller, chosen = exported(agent, tmp_path, self.languages[0]), []
+        env.reset(seed=5)
+        controller.begin(**drawn_in(env, agent.logic))
+
+        def act(observation):
+            chosen.append(network.action(np.concatenate([*observation.values()])))
+            return chosen[-1]
+
+        assert differences(env, act, agent.logic, controller.step, 50) == (0.0, 0.0, 50)
+        assert all(map(env.action_space.contains, chosen))
+        assert len(np.unique(chosen, axis=0)) > 1
+        env.close()
+
 
 class TestClosedLoop(Loops):
     languages = "C99", "C++"
