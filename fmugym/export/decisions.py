@@ -117,7 +117,7 @@ def _of_controller(policy: Policy, rows: Any, memory: Sequence[Any]) -> tuple[An
     if isinstance(policy.baseline, Law):
         action, state = policy.baseline.step(rows, memory[0])
         return [action], [state]
-    return policy.middle, []
+    return np.repeat(policy.middle, len(rows), axis=1), []
 
 
 def _network_of(policy: Policy) -> Network | None:

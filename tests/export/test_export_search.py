@@ -137,10 +137,17 @@ class Agents:
         assert [controller.step(row) for row in seen] == [[-10.0 + 20.0 * one] for one in chosen]
         env.close()
 
-    @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
-    def test_of_a_constant(self, text, tmp_path):
+    @pytest.mark.parametrize(
+        ("text", "form"),
+        [
+            (None, None),
+            (None, Agent("by hand", None, 0, 1)),
+            ("pid of=T setpoint=21 kp=0.001", Agent("by hand", None, 0, 1)),
+        ],
+    )
+    def test_of_a_constant(self, text, form, tmp_path):
         env = heater({"agent": PRESENT})
-        agent = agent_for(env, text, Agent("by hand", None, 0, 1))
+        agent = agent_for(env, text, form)
         made = agent_of(env, agent)
         assert made.network is None
         assert [one.name for one in made.logic.measurements] == ["T_op"] * (text is not None)
