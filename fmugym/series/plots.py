@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from io import StringIO
+from itertools import pairwise
 from textwrap import fill
 from typing import Any, Final
 
@@ -34,6 +35,7 @@ _UNITS_OF_TIME: Final = (
     *((3 * 86400, 86400, "days"), (3 * 3600, 3600, "hours"), (600, 60, "minutes")),
 )
 _MOST_LINES: Final = 8
+_MOST_POINTS: Final = 4_000
 _LONGEST_TEXT: Final = 24
 _WIDTH_OF_LEGEND: Final = 90
 _WIDTH_OF_KEY: Final = 8
@@ -219,7 +221,7 @@ def _draw(axis: Any, panel: _Panel, series: TimeSeries, times: Any) -> None:
         values = np.nancumsum(values) if panel.summed else values
         label = column.name.rpartition(".")[2] if panel.summed else column.name
         style = {"color": colour, "drawstyle": _drawstyle(column)}
-        axis.plot(times, values, label=_plain(label), **style)
+        axis.plot(*_thinned(times, values), label=_plain(label), **style)
     for setpoint in panel.setpoints:
         axis.plot(
             times,
@@ -275,6 +277,17 @@ def _fitting(texts: Sequence[Any]) -> Sequence[Any]:
 def _shortened(text: str | None) -> str:
     line = " ".join((text or "(empty)").split()) or "(blank)"
     return line if len(line) <= _LONGEST_TEXT else line[: _LONGEST_TEXT - 1] + "\u2026"
+
+
+def _thinned(times: Any, values: Any) -> tuple[Any, Any]:
+    """Leave out what no picture shows: of many points near each other, all but two extremes."""
+    if len(times) <= _MOST_POINTS:
+        return times, values
+    edges = np.linspace(0, len(times), _MOST_POINTS // 2 + 1).astype(int)
+    low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
+    found = [{a + np.argmin(low[a:b]), a + np.argmax(high[a:b])} for a, b in pairwise(edges)]
+    kept = np.unique([0, len(times) - 1, *(index for pair in found for index in pair)])
+    return times[kept], values[kept]
 
 
 def _drawstyle(column: Quantity) -> str:

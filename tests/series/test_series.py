@@ -15,7 +15,6 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, write_report
 from fmugym.series.plots import as_svg
-from fmugym.task.quantity import Quantity
 from fmugym.vector import FMUVectorEnv
 
 TASK = {
@@ -479,13 +478,20 @@ class TestPictures:
         with pytest.raises(ConfigError, match="one episode"):
             plot(series)
 
-    def test_long_episodes_make_small_pictures(self):
-        count = 100_000
-        columns = [Quantity(name, "index") for name in ("episode", "step")]
-        columns += [Quantity("time", "time", "s"), Quantity("noise", "output")]
-        noise = np.random.default_rng(0).normal(size=count)
-        rows = np.stack([np.zeros(count), np.arange(count), np.arange(count), noise], axis=1)
-        assert len(as_svg(TimeSeries(tuple(columns), rows))) < 400_000
+    def test_long_episodes_keep_their_extremes(self):
+        env = RecordSeries(
+            fmugym.load(TASK | {"episode_length": "1h", "terminated": False}), "angle"
+        )
+        env.reset(seed=0)
+        for _ in range(10_000):
+            env.step([0.1 * np.sin(env.unwrapped.time), 0])
+        (first, *_) = env.series.episodes().values()
+        (line, *_) = plot(first).axes[0].get_lines()
+        assert 1_000 < len(line.get_xdata()) < 5_000
+        assert line.get_ydata().max() == first["angle"].max()
+        assert line.get_ydata().min() == first["angle"].min()
+        assert len(as_svg(first)) < 400_000
+        env.close()
 
 
 class TestReport:
