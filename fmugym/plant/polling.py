@@ -98,15 +98,15 @@ class Poller:
 
     async def _poll(self) -> None:
         while True:
-            try:
-                async with AsyncExitStack() as connection:
+            async with AsyncExitStack() as connection:
+                try:
                     await self._converse(connection)
-            except ordinary(TimeoutError):
-                self._trouble = f"it does not answer within {self._timeout:g} s"
-            except ordinary(Exception) as error:  # whatever a library makes of a broken line
-                is_own = isinstance(error, LostError)
-                self._trouble = str(error) if is_own else f"{type(error).__name__}: {error}"
-                self.is_refused = isinstance(error, RefusedError)
+                except ordinary(TimeoutError):
+                    self._trouble = f"it does not answer within {self._timeout:g} s"
+                except ordinary(Exception) as error:  # whatever a library makes of a broken line
+                    is_own = isinstance(error, LostError)
+                    self._trouble = str(error) if is_own else f"{type(error).__name__}: {error}"
+                    self.is_refused = isinstance(error, RefusedError)
             await asyncio.sleep(self._interval / self._speed)
 
     async def _converse(self, connection: AsyncExitStack) -> None:

@@ -1,7 +1,9 @@
 """Plants: an agent in the shadow of one, and an FMU that is one, by Modbus TCP."""
 
+import asyncio
 import json
 import re
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from plant_tools import (
     house,
     watched,
 )
+from process_tools import wait_until
 from pymodbus.client import ModbusTcpClient
 
 import fmugym
@@ -29,6 +32,7 @@ from fmugym.fit import fit_logs
 from fmugym.lab import RealClock
 from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
+from fmugym.plant.polling import LostError, Poller
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
 from fmugym.tools.shadows import evaluate_log
@@ -311,6 +315,28 @@ class TestFaults:
             np.testing.assert_allclose(
                 first.series[name][here], second.series[name][there], atol=0.1
             )
+
+
+class Parting:
+    """A client that loses its server, and whose goodbye nobody answers."""
+
+    @asynccontextmanager
+    async def connected(self):
+        try:
+            yield
+        finally:
+            await asyncio.sleep(1e6)
+
+    async def read(self):
+        raise LostError("it is gone")
+
+
+def test_a_loss_is_told_before_the_goodbye():
+    poller = Poller(Parting(), RealClock(), interval=1.0, timeout=20.0)
+    try:
+        wait_until(lambda: poller.trouble("T") == "it is gone")
+    finally:
+        poller.stop()
 
 
 SEEN = {
