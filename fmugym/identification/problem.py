@@ -469,11 +469,10 @@ def _start_between(variable: Variable, low: float, high: float) -> float:
 def _counted(trajectory: Trajectory, wash_in: float | None) -> MaskArray:
     """Which samples of a trajectory count: those after the wash-in."""
     since = trajectory.time - trajectory.time[0]
-    counted = since > (-1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0))
+    begin = -1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0)
+    counted = since > begin
     if not counted.any():
-        raise ConfigError(
-            f"a log of {since[-1]:g} s has no samples after a wash-in of {wash_in:g} s"
-        )
+        raise ConfigError(f"a log of {since[-1]:g} s has no samples after a wash-in of {begin:g} s")
     return np.asarray(counted)
 
 

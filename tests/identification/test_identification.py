@@ -3,6 +3,7 @@
 import os
 import sys
 from contextlib import closing
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -292,7 +293,7 @@ class TestOutputError:
         assert late.values["l"] == pytest.approx(0.1, rel=1e-3)
         assert abs(early.values["l"] - 0.1) > 20 * abs(late.values["l"] - 0.1)
         with pytest.raises(fmugym.ConfigError, match="no samples after a wash-in of 9 s"):
-            fit_parameters(PENDULUM, {"l": 0.12}, [logged], wash_in=9, **options)
+            fit_parameters(PENDULUM, {"l": 0.12}, [logged], wash_in=Fraction(9), **options)
 
     def test_candidates_find_what_one_start_misses(self):
         """A length that is wrong by a half puts the swings out of phase."""
