@@ -90,12 +90,16 @@ def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, hooks
 
 
 @each_way
-def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks, make_envs):
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks, dtype, make_envs):
     class Uninterested(Drawing):
+        def _get_action_space(self):
+            return gym.spaces.Box(-1.0, 1.0, (1,), dtype)
+
         def _get_inputs(self):
             return 0.0 * self.step_count
 
     vector = make_envs(Uninterested, 2, hooks=hooks)
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1"):
-        vector.step(np.array([[0.0], [np.nan]], np.float32))
+        vector.step(np.array([[0.0], [np.nan]], dtype))
