@@ -103,7 +103,8 @@ def latest_checkpoint(folder: Path) -> tuple[Path, int]:
         ConfigError: If there is none.
     """
     facts = read_facts(folder, CHECKPOINT, NOTHING_TO_RESUME, "folder", "steps")
-    return folder / facts["folder"], facts["steps"]
+    with reading(f"{shown(str(folder))} {NOTHING_TO_RESUME}"):
+        return folder / facts["folder"], int(facts["steps"])
 
 
 def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[str, Any], bool]:

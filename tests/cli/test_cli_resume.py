@@ -134,6 +134,10 @@ class TestResume:
         code, _, err = cli("train", task, "--output", folder, "--resume")
         assert code == 1
         assert "cannot be resumed" in err
+        for facts in ({"folder": 3, "steps": 64}, {"folder": place.name, "steps": None}):
+            (folder / "checkpoint.json").write_text(json.dumps(facts))
+            code, _, err = cli("train", task, "--output", folder, "--resume")
+            assert (code, "no training to resume" in err) == (1, True)
 
 
 def steps_of(folder):
