@@ -292,7 +292,9 @@ class Declarations:
                 self.variables.check_input(entry, variable)
                 _check_action(variable)
         entry = self.root.child("agent").child("actions")
-        if len({bool(variable.levels) for variable in actions}) > 1:
+        mistakes = self.root.mistakes
+        hidden = any(mistakes.explain(("variables", one.alias, "levels")) for one in actions)
+        if not hidden and len({bool(variable.levels) for variable in actions}) > 1:
             entry.note(entry.error("either all actions have levels, or none has"))
         return actions
 

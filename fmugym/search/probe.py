@@ -49,6 +49,8 @@ class Probe:
         is_same: Whether all episodes are the same.
         only_return: What has been reached by all actions in all episodes; None if that differs.
         seconds: Real time of a step of one environment among many.
+        left_out: The names of controllers that the task declares: they give one action, but there
+            are several.
     """
 
     task: Mapping[str, Any]
@@ -59,6 +61,7 @@ class Probe:
     is_same: bool
     only_return: float | None
     seconds: float
+    left_out: Sequence[str] = ()
 
     @classmethod
     def of(cls, make_env: Callable[[], FMUEnv], envs: int) -> Probe:
@@ -77,11 +80,12 @@ class Probe:
             guesses = guessed_controllers(task, env)
             length = env.config.max_episode_steps or getattr(env.spec, "max_episode_steps", None)
             limits = dict(getattr(env, "cost_limits", {}))
-        agents = [
+        declared = [
             Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")
             for name, one in task.get("controllers", {}).items()
             if not plans_ahead(one)
         ]
+        agents = declared if len(policy.choices or policy.limits) == 1 else []
         linear = Agent("linear", None, len(policy.names), policy.acting)
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
@@ -105,6 +109,7 @@ class Probe:
             is_same=not np.ptp(seen, axis=1).any(),
             only_return=float(returns[0, 0]) if np.ptp(returns) == 0 else None,
             seconds=seconds,
+            left_out=[one.name for one in declared if one not in agents],
         )
 
     @property

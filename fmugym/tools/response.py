@@ -1,4 +1,4 @@
-"""How outputs follow inputs: whether they do at all, and whether episodes are long enough."""
+"""How outputs follow inputs, and whether episodes are long enough for them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.pool.base import FloatArray
 from fmugym.tools.accuracy import Replay
-from fmugym.tools.findings import Advice, Finding
+from fmugym.tools.findings import Advice
 from fmugym.tools.skeleton import rounded_down
 
 __all__ = ["advise_episodes"]
@@ -42,21 +42,14 @@ _LONG: Final = 800
 """At least so many steps those then take, as actions may follow what is faster."""
 
 
-def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Finding]:
-    """Tell outputs that never change, and recommend longer episodes where outputs are slow.
+def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice]:
+    """Recommend longer episodes where outputs are slow.
 
     Args:
         replay: An episode.
         steps: How many steps one takes.
     """
     constants = _time_constants(replay, steps)
-    still = [
-        one.name for one in constants if not constants[one] and one.variability == "continuous"
-    ]
-    if still:
-        text = f"never change while an action is held: {', '.join(still)}"
-        cure = "leave them out of observations under [agent]"
-        yield Finding("warning", "observations", text, cure)
     seconds, name = max(((constants[one], one.name) for one in constants), default=(0.0, ""))
     time_step = replay.spec.time_step
     if seconds <= steps * time_step:

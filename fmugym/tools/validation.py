@@ -6,6 +6,7 @@ checks look for tasks that run but cannot be learned.
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -112,11 +113,7 @@ def _advised(report: Report, replay: Replay, steps: int | None) -> Report:
     found = list(advise(replay))
     known = {one.key for one in found if isinstance(one, Advice)}
     if steps is not None:
-        found += (
-            one
-            for one in advise_episodes(replay, steps)
-            if isinstance(one, Finding) or one.key not in known
-        )
+        found += (one for one in advise_episodes(replay, steps) if one.key not in known)
     advices = (*(one for one in found if isinstance(one, Advice)), *report.advices)
     short = (one for one in advices if one.key == "episode_length")
     findings = [
@@ -191,10 +188,11 @@ def _play(
     choose: Callable[[], Any] | None,
     options: Mapping[str, Any] | None = None,
     most_steps: int = _MOST_STEPS,
+    seed: int = 0,
 ) -> _Episode:
     """Play an episode, or only its beginning."""
     begin = time.perf_counter()
-    observation, _ = env.reset(seed=0, options=options)
+    observation, _ = env.reset(seed=seed, options=options)
     after_reset = time.perf_counter()
     observations: list[Any] = [_flat(observation)]
     rewards: list[float] = []
@@ -228,7 +226,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield from _of_parameters(env)
     yield from _of_inputs(env)
     yield _of_reward(first, [episode for pair in pairs.values() for episode in pair])
-    yield from _of_observations(env, first)
+    yield from _of_observations(env, first, _play(env, env.action_space.sample, seed=1))
     yield _of_length(env)
     yield _of_export(env)
 
@@ -431,7 +429,7 @@ def _advice_of_reward(env: FMUEnv, rewards: FloatArray) -> Iterator[Advice]:
         yield Advice("", "reward", f"{factor:g} * ({given}{offset})", why)
 
 
-def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
+def _of_observations(env: FMUEnv, first: _Episode, second: _Episode) -> Iterator[Finding]:
     space, seen = env.observation_space, first.observations
     if not isinstance(space, spaces.Box):
         return
@@ -439,6 +437,7 @@ def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     findings = [*_of_limits(env, space, names, seen)]
     if not _is_normalized(env):
         findings += _of_sizes(names, seen)
+    findings += _of_still(env, names, np.concatenate([seen, second.observations]))
     fine = Finding("ok", "observations", "within their limits, and of similar sizes")
     yield from findings or [fine]
 
@@ -479,6 +478,27 @@ def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
             f"{_UNEVEN}: {largest} reaches {sizes.max():.4g}",
             "give min and max and normalize = true under [agent], or another unit",
         )
+
+
+def _of_still(env: FMUEnv, names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
+    """Tell continuous outputs that have one value in two episodes."""
+    outputs = {one.name for one in quantities_of(env).all if one.kind == "output"}
+    still = [
+        name
+        for name in itertools.compress(names, np.ptp(seen, axis=0) == 0.0)
+        if name in outputs and env.fmu.variable(_own_name(env, name)).variability == "continuous"
+    ]
+    if still:
+        text = f"never change, whatever the actions: {', '.join(still)}"
+        cure = "leave them out of observations under [agent]"
+        yield Finding("warning", "observations", text, cure)
+
+
+def _own_name(env: FMUEnv, name: str) -> str:
+    """What the FMU calls a variable that has a name in the task."""
+    task = getattr(env, "task", None)
+    given = task.document.get("variables", {}) if isinstance(task, Task) else {}
+    return str(given.get(name, {}).get("name", name))
 
 
 def _of_length(env: FMUEnv) -> Finding:

@@ -125,6 +125,11 @@ class Searching:
                 f"{self.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
             )
         probe = Probe.of(self.make_env, self.envs)
+        if probe.left_out:
+            self.tell(
+                f"left out: {', '.join(probe.left_out)}: there are several actions, and each "
+                "gives one"
+            )
         if probe.only_return is not None:
             self.tell(
                 f"warning: all episodes have reached {probe.only_return:g}, whatever the actions: "

@@ -201,6 +201,21 @@ def test_outputs_that_never_change_are_told(lag):
     assert told.text.endswith(": fast")
 
 
+@pytest.mark.parametrize(
+    ("rate", "observed"),
+    [
+        (0.0, ["x"]),  # the reward alone reads fast
+        (1.0, ["x", "change"]),  # 0 before the first step, and while an action is held
+        ({"distribution": "uniform", "low": 0.5, "high": 1.0}, ["x", "rated"]),
+    ],
+)
+def test_what_an_agent_needs_or_does_not_observe_is_not_told_to_be_left_out(lag, rate, observed):
+    """What stays the same in an episode, and is drawn for each, tells which plant this is."""
+    seen = {"agent": {"actions": ["u"], "observations": observed}, "reward": "-abs(x - fast)"}
+    _, report = advised(lag_task(lag, rate, **seen))
+    assert not [one.text for one in report.findings if "never change" in one.text]
+
+
 @pytest.mark.parametrize(("limit", "expected"), [(200.0, True), (5.0, None), (0.001, True)])
 def test_actions_of_another_size_than_algorithms_explore_are_rescaled(limit, expected):
     variables = {"tau": {"min": -limit, "max": limit}}

@@ -122,6 +122,16 @@ def test_mistakes_are_placed(variable, fact):
         fmugym.load(PLAIN | {"variables": {"u": variable}})
 
 
+def test_mistakes_in_levels_are_told_alone():
+    """Whether all actions have levels cannot be known then."""
+    variables = {"u": {"name": "tau", "levels": [0, 1]}, "v": {"levels": [1]}}
+    agent = PLAIN["agent"] | {"actions": ["u", "v"]}
+    with pytest.raises(TaskError) as caught:
+        fmugym.load(PLAIN | {"variables": variables, "agent": agent})
+    assert "two or more" in str(caught.value)
+    assert "none has" not in str(caught.value)
+
+
 def test_observations_have_no_delta():
     variables = {"u": {"name": "tau"}, "q": {"delta": 1}}
     with pytest.raises(TaskError, match=r"variables\.q.*observed"):

@@ -1189,6 +1189,19 @@ class TestSearch:
         assert "constant action" in told[0]
         assert facts["baseline"] == "constant action"
 
+    def test_controllers_of_one_action_do_not_act_on_two(self, tmp_path):
+        """A warm-up may need them all the same."""
+        told = []
+        two = {
+            "variables": dict.fromkeys(("tau", "spare"), FALLING["variables"]["tau"]),
+            "agent": FALLING["agent"] | {"actions": ["tau", "spare"]},
+            "controllers": CONTROLLERS | {"still": 0},
+            "warm_up": {"period": "50ms", "controller": {"tau": "lazy"}},
+        }
+        facts = searched(tmp_path / "agent", **two, told=told, rounds=8)
+        assert told[0] == "left out: lazy, pi, still: there are several actions, and each gives one"
+        assert facts["baseline"] == "constant action"
+
     def test_few_rounds_give_what_they_have_come_to(self, tmp_path):
         """Also before the first validation."""
         one = {"pi": CONTROLLERS["pi"]}
