@@ -127,7 +127,7 @@ class Search:
     # Rounds.
 
     def advance(self, arena: Arena) -> None:
-        """Go on by one round, or by the two that tell what observations are like."""
+        """Go on by one round, or by those that tell what observations are like."""
         if self.tuning:
             self._play(self.tuning, arena)
         elif self.baseline is None:
@@ -216,14 +216,34 @@ class Search:
 
         Only the best candidates count: policies that are worth something see the like, while others
         may drive the process far away. Without a controller, some constants are small: only these
-        keep an unstable process near.
+        keep an unstable process near. All of them let a process drift that integrates them, so that
+        policies without a controller, with weights at random, then tell it anew.
         """
-        seen: list[tuple[Merit, Any]] = []
+        constants = []
         for text in (controller, None):
             sizes = np.geomspace(1.0, _FINEST if text is None else 1.0, _MANY)[:, None]
             rows = history.extended(sizes * self._rng.uniform(-1, 1, (_MANY, history.acting)))
+            constants.append((replace(history, text=text), rows))
+        scale = self._seen_by_the_best(arena, constants)
+        if controller is not None:
+            return scale
+        random = replace(history, scale=scale)
+        rows = random.extended(self._rng.standard_normal((_MANY, self.probe.linear.size)))
+        return self._seen_by_the_best(arena, [(random, rows)])
+
+    def _seen_by_the_best(
+        self, arena: Arena, candidates: Sequence[tuple[Agent, FloatArray]]
+    ) -> FloatArray:
+        """What observations are like for the best part of some candidates.
+
+        Args:
+            arena: Where they play.
+            candidates: Those of each round: an agent, and their weights.
+        """
+        seen: list[tuple[Merit, Any]] = []
+        for agent, rows in candidates:
             seeds = self._training(self.episodes)
-            outcome = arena.play(replace(history, text=text), rows, seeds, has_moments=True)
+            outcome = arena.play(agent, rows, seeds, has_moments=True)
             seen += zip(outcome.merits, outcome.moments.sum(axis=1), strict=True)
             self.rounds += 1
         best = sorted(seen, key=lambda one: one[0])[-(len(seen) // _BEST_PART) :]
