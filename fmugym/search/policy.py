@@ -195,7 +195,7 @@ class Policy(Controller):
     the controller's own action.
 
     Args:
-        baseline: The controller; None for the middle of the range, or the first of the choices.
+        baseline: The controller; None for the middle of the range.
         agent: Tells the network, and what the policy is for.
     """
 
@@ -257,8 +257,8 @@ class Policy(Controller):
 
     @property
     def middle(self) -> FloatArray:
-        """The middle of each range, or the first choice of each part: shape (m, N)."""
-        middle = [float(one[0]) for one in self.choices] or [(a + b) / 2 for a, b in self.limits]
+        """The middle of each range, shape (m, N); m is 0 if there are choices."""
+        middle = [(low + high) / 2 for low, high in self.limits]
         return np.repeat(np.array(middle)[:, None], self.count, axis=1)
 
     @property

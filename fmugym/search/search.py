@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -194,60 +194,53 @@ class Search:
         return CMA(mean, sigma, population, self._rng, largest=_LARGEST, growth=_GROWTH)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
-        """Find the scale of what is observed, and let classes of policies enter."""
+        """Find the scale of what is observed, and let classes of policies enter.
+
+        Linear ones are followed by those that also see the past.
+        """
         linear = self.probe.linear
         history = replace(linear, name="linear with history", history=True)
         network = replace(linear, name="network", hidden=16)
         scale = self._scale(arena, history, baseline.text)
-        agents = [
+        *linear_ones, network = (
             replace(one, scale=scale[:, : one.features]) for one in (linear, history, network)
-        ]
-        if baseline.text is not None:
-            first, then, _ = (
-                replace(one, name=f"{baseline.name} + {one.name}", text=baseline.text)
-                for one in agents
-            )
-            self._contenders.append(self._entrant(first, then))
-            del agents[1]  # only these observations are like those that were seen
-        self._contenders += map(self._entrant, agents)
+        )
+        for text in dict.fromkeys((baseline.text, None)):
+            prefix = f"{baseline.name} + " if text else ""
+            pair = (replace(one, name=prefix + one.name, text=text) for one in linear_ones)
+            self._contenders.append(self._entrant(*pair))
+        self._contenders.append(self._entrant(network))
 
     def _scale(self, arena: Arena, history: Agent, controller: str | None) -> FloatArray:
-        """What observations are like while candidates add constants to what agents decide.
+        """What observations are like while candidates add constants to what a controller decides.
 
-        Only the best candidates count: policies that are worth something see the like, while others
-        may drive the process far away. Without a controller, some constants are small: only these
-        keep an unstable process near. All of them let a process drift that integrates them, so that
-        policies without a controller, with weights at random, then tell it anew.
+        Without a controller, some constants are small: only these keep an unstable process near.
+        All of them let a process drift that integrates them, so that linear policies with weights
+        at random then tell the scale anew.
         """
-        constants = []
-        for text in (controller, None):
-            sizes = np.geomspace(1.0, _FINEST if text is None else 1.0, _MANY)[:, None]
-            rows = history.extended(sizes * self._rng.uniform(-1, 1, (_MANY, history.acting)))
-            constants.append((replace(history, text=text), rows))
-        scale = self._seen_by_the_best(arena, constants)
         if controller is not None:
-            return scale
-        random = replace(history, scale=scale)
-        rows = random.extended(self._rng.standard_normal((_MANY, self.probe.linear.size)))
-        return self._seen_by_the_best(arena, [(random, rows)])
+            return self._seen(arena, replace(history, text=controller), history.acting)
+        scale = self._seen(arena, history, history.acting, _FINEST)
+        return self._seen(arena, replace(history, scale=scale), self.probe.linear.size)
 
-    def _seen_by_the_best(
-        self, arena: Arena, candidates: Sequence[tuple[Agent, FloatArray]]
-    ) -> FloatArray:
-        """What observations are like for the best part of some candidates.
+    def _seen(self, arena: Arena, agent: Agent, width: int, finest: float = 1.0) -> FloatArray:
+        """What observations are like for the best of some candidates.
+
+        Policies that are worth something see the like, while others may drive the process far away.
 
         Args:
             arena: Where they play.
-            candidates: Those of each round: an agent, and their weights.
+            agent: What they have in common.
+            width: How many weights they have, at random; the others are 0.
+            finest: The size of the smallest weights; that of the largest ones is 1.
         """
-        seen: list[tuple[Merit, Any]] = []
-        for agent, rows in candidates:
-            seeds = self._training(self.episodes)
-            outcome = arena.play(agent, rows, seeds, has_moments=True)
-            seen += zip(outcome.merits, outcome.moments.sum(axis=1), strict=True)
-            self.rounds += 1
-        best = sorted(seen, key=lambda one: one[0])[-(len(seen) // _BEST_PART) :]
-        return scale_of(sum(moments for _, moments in best))
+        sizes = np.geomspace(1.0, finest, _MANY)[:, None]
+        rows = agent.extended(sizes * self._rng.standard_normal((_MANY, width)))
+        outcome = arena.play(agent, rows, self._training(self.episodes), has_moments=True)
+        self.rounds += 1
+        order = sorted(range(_MANY), key=outcome.merits.__getitem__)
+        best = outcome.moments[order[-(_MANY // _BEST_PART) :]]
+        return scale_of(best.sum(axis=(0, 1)))
 
     # Who wins.
 
