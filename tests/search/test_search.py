@@ -344,6 +344,7 @@ def test_a_search_among_what_is_no_number_goes_on():
         for _ in range(5):
             entrant.play(Field(most), range(2))
         entrant.validate(Field(most), range(2))
+        assert entrant.best is not None
     assert np.isfinite(entrant.merit).all()
     assert entrant.best.weights.shape == (2,)
 
