@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
@@ -21,9 +21,6 @@ MOST_ENVS: Final = 256
 MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
 
-Make = Callable[[FloatArray], Controller]
-"""Makes one controller for N environments, from the numbers of each of them, shape (N, k)."""
-
 Merit = tuple[float, float]
 """How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
 
@@ -37,7 +34,8 @@ class Outcome(NamedTuple):
 
     Attributes:
         returns: The total rewards, shape (n, k).
-        costs: The total of each cost that has a limit, shape (n, k, c).
+        costs: The total of each cost that has a limit, and 1 for an episode that a fault has cut
+            short, shape (n, k, c + 1).
         limits: The limits by name.
         moments: The totals of ``moments`` of the controllers, shape (n, k, r); r is 0 if nobody
             has asked for them.
@@ -50,14 +48,19 @@ class Outcome(NamedTuple):
 
     @property
     def merits(self) -> list[Merit]:
-        """The merit of each candidate: those within the limits of all costs come first."""
-        bounds = np.array([*self.limits.values()])
+        """The merit of each candidate: those within the limits of all costs come first.
+
+        A fault is an excess, too, as its episode has less to pay for. NaN is an infinite one.
+        """
+        bounds = np.array([*self.limits.values(), 0.0])
         sizes = np.where(bounds == 0.0, 1.0, np.abs(bounds))
-        beyond = np.maximum(self.costs.mean(axis=1) - bounds, 0.0)
-        excess = (beyond / sizes).sum(axis=1)
-        return list(zip((-excess).tolist(), self.returns.mean(axis=1).tolist(), strict=True))
+        beyond = np.maximum(self.costs.mean(axis=1) - bounds, 0.0) / sizes
+        returns = self.returns.mean(axis=1)
+        excess = np.nan_to_num(beyond.sum(axis=1) + 0 * returns, nan=np.inf)
+        return list(zip((-excess).tolist(), returns.tolist(), strict=True))
 
 
+@dataclass
 class Arena:
     """A vector environment in which candidates play the same episodes.
 
@@ -65,43 +68,46 @@ class Arena:
     candidates and episodes are too many for them, they play in groups, with the same result. Where
     they are too few, the other environments rest.
 
-    Args:
+    Attributes:
         make_env: A function that makes the environment, or its class.
         most_envs: The largest number of environments.
         most_steps: Steps after which an episode is stopped.
         limits: What costs may add up to in an episode, by name.
-
-    Attributes:
         steps: The steps of all episodes until now.
         seconds: The real time that they have taken.
         ceiling: The largest number of steps.
+        longest: The steps of the longest episode until now.
+        infos: Those of the last step.
     """
 
-    def __init__(
-        self,
-        make_env: Callable[[], Any],
-        most_envs: int = MOST_ENVS,
-        most_steps: int = MOST_STEPS,
-        limits: Mapping[str, float] | None = None,
-    ) -> None:
-        self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
-        self._limits = limits or {}
-        self._envs: FMUVectorEnv | None = None
-        self.steps, self.seconds, self.ceiling = 0, 0.0, math.inf
+    make_env: Callable[[], Any]
+    most_envs: int = MOST_ENVS
+    most_steps: int = MOST_STEPS
+    limits: Mapping[str, float] = field(default_factory=dict)
+    steps: int = 0
+    longest: int = 0
+    seconds: float = 0.0
+    ceiling: float = np.inf
+    infos: Any = None
+    _envs: FMUVectorEnv | None = None
 
     def close(self) -> None:
         """Close the environments."""
         if self._envs is not None:
             self._envs.close()
-            self._envs = None
 
     def play(
-        self, make: Make, numbers: FloatArray, seeds: Sequence[int], has_moments: bool = False
+        self,
+        make: Callable[[FloatArray], Controller],
+        numbers: FloatArray,
+        seeds: Sequence[int],
+        has_moments: bool = False,
     ) -> Outcome:
         """Let candidates play.
 
         Args:
-            make: Makes the controller of a group.
+            make: Makes one controller for N environments, from the numbers of each of them, shape
+                (N, k).
             numbers: What the candidates differ in, shape (n, k).
             seeds: The seeds of their episodes.
             has_moments: Whether to add up ``moments`` of controllers, which they have after each
@@ -111,51 +117,51 @@ class Arena:
             CeilingError: If more steps are needed than there may be.
         """
         jobs = np.arange(len(numbers) * len(seeds))
-        envs = self._opened(len(jobs))
-        groups = []
+        size = min(len(jobs), self.most_envs)
+        if self._envs is None or self._envs.num_envs < size:
+            self.close()
+            self._envs = FMUVectorEnv(self.make_env, size)
+        envs, groups = self._envs, []
         for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
             who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
             controller = make(numbers[who]).bind(envs)
-            own = np.array(seeds)[which].tolist()
-            begin = perf_counter()
+            begin, own = perf_counter(), np.array(seeds)[which].tolist()
             totals = self._play(envs, controller, own, len(part), has_moments)
             self.seconds += perf_counter() - begin
             groups.append(totals[:, : len(part)])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
-        costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._limits)], axis=-1)
-        return Outcome(totals[0], costs, self._limits, moments)
-
-    def _opened(self, jobs: int) -> FMUVectorEnv:
-        """Environments for so many episodes, or as many as there may be."""
-        size = min(jobs, self._most_envs)
-        if self._envs is None or self._envs.num_envs < size:
-            self.close()
-            self._envs = FMUVectorEnv(self._make_env, size)
-        return self._envs
+        costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
+        return Outcome(totals[0], costs, self.limits, moments)
 
     def _play(
         self, envs: FMUVectorEnv, controller: Any, seeds: list[int], count: int, has_moments: bool
     ) -> FloatArray:
-        """Rewards, costs and moments, summed over an episode, shape (1 + c + r, N).
+        """Rewards, costs, faults and moments, summed over an episode, shape (2 + c + r, N).
 
         Environments from ``count`` on rest, as do those whose episodes have ended.
         """
         observations, infos = envs.reset(seed=seeds)
         totals: FloatArray = np.zeros(())
         running = np.arange(len(seeds)) < count
-        for _ in range(self._most_steps):
+        for step in range(self.most_steps):
             count = int(np.count_nonzero(running))
             if not count:
                 break
             if self.steps + count > self.ceiling:
                 raise CeilingError(f"{self.ceiling:g} steps are too few: give more")
             self.steps += count
+            self.longest = max(self.longest, step + 1)
             actions = controller.act(observations, infos)
-            are_all = count == len(seeds)
-            result = envs.step(actions) if are_all else envs.step_around(actions, ~running)
-            observations, rewards, terminated, truncated, infos = result
-            moments = controller.moments if has_moments else ()
-            values = rewards, *(infos["costs"][name] for name in self._limits), *moments
+            observations, rewards, terminated, truncated, infos = (
+                envs.step(actions) if count == len(seeds) else envs.step_around(actions, ~running)
+            )
+            self.infos = infos
+            values = (
+                rewards,
+                *(infos["costs"][name] for name in self.limits),
+                truncated & infos.get("_fault", False),
+                *(controller.moments if has_moments else ()),
+            )
             totals = totals + np.where(running, np.stack(values), 0.0)
             running = running & ~(terminated | truncated)
         return totals

@@ -73,7 +73,7 @@ class Entrant:
         self.cma.tell(np.array(order))
         self.rounds += 1
         reached = merits[order[0]]
-        if reached > self.lead:
+        if not reached <= self.lead:  # NaN included
             self.leader, self.lead = found[order[0]], reached
         self._note_agreement(outcome.returns)
         return reached
@@ -109,7 +109,7 @@ class Entrant:
         merits = arena.play(self.make, np.stack([self.cma.mean, self.leader]), seeds).merits
         if merits[1] > merits[0]:
             self.cma.mean = self.leader
-        if max(merits) > self.merit:
+        if not max(merits) <= self.merit:
             self.merit, self.gained = max(merits), self.rounds
             self.best = self.make.with_numbers(self.cma.mean)
         self.lead = NO_MERIT

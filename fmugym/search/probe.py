@@ -12,6 +12,7 @@ import numpy as np
 from fmugym.baselines.arena import MOST_STEPS, Arena
 from fmugym.baselines.parsing import plans_ahead
 from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
 from fmugym.search.flattening import require_numbers
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import Agent, Policy
@@ -49,6 +50,7 @@ class Probe:
         is_same: Whether all episodes are the same.
         only_return: What has been reached by all actions in all episodes; None if that differs.
         seconds: Real time of a step of one environment among many.
+        usual_steps: The steps of an episode: of the longest one, if all have ended early.
         left_out: The names of controllers that the task declares: they give one action, but there
             are several.
     """
@@ -61,6 +63,7 @@ class Probe:
     is_same: bool
     only_return: float | None
     seconds: float
+    usual_steps: int = _STEPS
     left_out: Sequence[str] = ()
 
     @classmethod
@@ -72,7 +75,7 @@ class Probe:
             envs: The largest number of environments.
 
         Raises:
-            ConfigError: If no policy can be searched for the task.
+            ConfigError: If no policy can be searched for the task, or its first step always fails.
         """
         with closing(make_env()) as env:
             require_numbers(env.observation_space, env.action_space)
@@ -90,16 +93,21 @@ class Probe:
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
-        def play(actions: int, most_steps: int) -> tuple[Any, float]:
+        def play(actions: int, most_steps: int) -> tuple[Any, float, Arena]:
             with closing(Arena(make_env, envs, most_steps)) as arena:
                 outcome = arena.play(linear, rows[:actions], range(_EPISODES), has_moments=True)
-                return outcome, arena.seconds / arena.steps
+                return outcome, arena.seconds / arena.steps, arena
 
-        outcome, seconds = play(_ACTIONS, _STEPS)
+        outcome, seconds, arena = play(_ACTIONS, _STEPS)
+        if arena.steps == outcome.costs.sum():
+            raise ConfigError(
+                f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
+                "'fmugym validate' tells more"
+            )
         returns = outcome.returns
         seen = np.dstack([returns, outcome.moments])
         if seconds < _QUICK:
-            _, seconds = play(FEW, _TIMED)
+            _, seconds, _ = play(FEW, _TIMED)
         return cls(
             task,
             linear,
@@ -109,6 +117,7 @@ class Probe:
             is_same=not np.ptp(seen, axis=1).any(),
             only_return=float(returns[0, 0]) if np.ptp(returns) == 0 else None,
             seconds=seconds,
+            usual_steps=arena.longest if arena.longest < _STEPS else length or MOST_STEPS,
             left_out=[one.name for one in declared if one not in agents],
         )
 
@@ -118,8 +127,8 @@ class Probe:
         return self.length or MOST_STEPS
 
     def round_time(self, episodes: int) -> float:
-        """About how many seconds a round of a controller takes."""
-        return self.seconds * self.most_steps * FEW * episodes
+        """About how many seconds a round of a controller takes, until episodes become longer."""
+        return self.seconds * self.usual_steps * FEW * episodes
 
 
 def task_of(env: Any) -> dict[str, Any]:

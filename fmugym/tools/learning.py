@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from math import isfinite
@@ -186,8 +186,18 @@ def _search(arguments: argparse.Namespace) -> None:
         say_json({"task": arguments.task, "output": arguments.output, **facts})
     else:
         say(facts["verdict"])
+        _tell_faults(
+            {name: one["mean_costs"]["failed episodes"] for name, one in facts["test"].items()}
+        )
         options = f"; --rounds {facts['rounds']} repeats the search"
         tell(f"{arguments.output} has the agent{options if facts['rounds'] else ''}")
+
+
+def _tell_faults(parts: Mapping[str, float]) -> None:
+    """Tell what may have decided beside the rewards."""
+    if any(parts.values()):
+        listing = ", ".join(f"{name} {100 * part:.3g} %" for name, part in parts.items())
+        tell(f"episodes that a fault has cut short, which count before the reward: {listing}")
 
 
 def _lines() -> Advance:

@@ -9,6 +9,7 @@ import logging
 import os
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
@@ -56,6 +57,7 @@ Commands = Any
 HELP_OF_TASK: Final = "a task file, a registered id or module:Class"
 _CONTROLLER: Final = "a controller and its arguments: 'pid of=T setpoint=21 kp=0.5 ti=14400'"
 _ACTION: Final = "random, or the numbers of one action: 0.5,-1"
+_OF_ONE_KIND: Final = 3
 MINARI: Final = "minari:"
 """What the name of a dataset of Minari begins with, where files or FMUs may be named, too."""
 
@@ -268,17 +270,32 @@ def tell(text: str, *, is_needed: bool = False) -> None:
 
 @contextmanager
 def speaking(arguments: argparse.Namespace) -> Iterator[None]:
-    """Say as much as ``--quiet`` and ``--verbose`` ask for."""
+    """Say as much as ``--quiet`` and ``--verbose`` ask for.
+
+    Without them, warnings of one kind are told some times only: where thousands of episodes are
+    played, thousands may fail in the same way.
+    """
     logger, handler = logging.getLogger("fmugym"), logging.StreamHandler(sys.stderr)
     handler.setLevel(logging.ERROR if arguments.quiet else logging.INFO)
     token, level = quiet.set(arguments.quiet), logger.level
+    kinds: Counter[tuple[str, int]] = Counter()
+
+    def is_told(record: logging.LogRecord) -> bool:
+        kind = record.pathname, record.lineno
+        kinds[kind] += 1
+        return kinds[kind] <= _OF_ONE_KIND
+
     if arguments.verbose:
         logger.setLevel(logging.INFO)
-    if arguments.quiet or arguments.verbose:
-        logger.addHandler(handler)
+    else:
+        handler.addFilter(is_told)
+    logger.addHandler(handler)
     try:
         yield
     finally:
+        left_out = sum(max(0, count - _OF_ONE_KIND) for count in kinds.values())
+        if left_out:
+            note(f"{left_out} more warnings of these kinds; -v shows them")
         quiet.reset(token)
         logger.removeHandler(handler)
         logger.setLevel(level)

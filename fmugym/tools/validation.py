@@ -100,7 +100,8 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         }
         hooks = _hooks(make_env)
         recommended = _recommended(env, first.step_time, hooks, findings)
-        reset_method, replay, steps = env.reset_method, Replay.of(env), env.config.max_episode_steps
+        reset_method, replay = env.reset_method, Replay.of(env)
+        steps = None if first.terminated else env.config.max_episode_steps
         others = (*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards))
     finally:
         env.close()
@@ -235,12 +236,11 @@ def _of_faults(first: _Episode) -> Finding:
     steps = len(first.rewards)
     if first.fault is None:
         return Finding("ok", "run", f"{steps} steps with random actions")
-    return Finding(
-        "error",
-        "run",
-        f"step {steps} of random actions failed: {first.fault}",
-        "narrow the limits of the actions, shorten the time step, or use more substeps",
-    )
+    cure = "narrow the limits of the actions, shorten the time step, or use more substeps"
+    if "the reward" in first.fault or "_reward_policy" in first.fault:
+        cure = "look for a division by 0, a logarithm, a root or a power in the reward"
+    text = f"step {steps} of random actions failed: {first.fault}"
+    return Finding("error", "run", text, cure)
 
 
 def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
@@ -343,10 +343,12 @@ def _has_effect(env: FMUEnv, given: Mapping[str, Any]) -> bool:
         for place in (0, 1)
     ]
     try:
-        episodes = [_play(env, _always(_middle(env.action_space)), one) for one in options]
+        return any(
+            _differ(*(_play(env, _always(action), one) for one in options))
+            for action in _constants(env.action_space)
+        )
     except FMUGymError:  # the FMU does not take a value that was made up here
         return True
-    return _differ(*episodes)
 
 
 def _two_values(env: FMUEnv, name: str, value: Any) -> list[Any]:
@@ -378,6 +380,12 @@ def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
             f"stay at their start values: {', '.join(idle)}",
             "write them by actions, [inputs] or data, or fix them under [parameters]",
         )
+
+
+def _constants(space: Any) -> Iterator[Any]:
+    """Actions that show effects: the middle one, at which a process may rest, and another one."""
+    yield _middle(space)
+    yield from (first for _, first, _ in itertools.islice(_extremes(space, ()), 1))
 
 
 def _middle(space: Any) -> Any:

@@ -29,7 +29,7 @@ def judge(
     Returns:
         By the names of the agents, in types that JSON has: ``total_reward``, the mean of an
         episode summed over the scenarios; ``rewards`` of the episodes by scenario; and
-        ``mean_costs`` by name.
+        ``mean_costs`` by name, with the part of ``failed episodes``, which a fault has cut short.
     """
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes)
     played = []
@@ -43,7 +43,7 @@ def judge(
         test[name] = {
             "total_reward": sum(float(one.returns.mean()) for one in outcomes),
             "rewards": dict(zip(arenas, rewards, strict=True)),
-            "mean_costs": dict(zip(outcomes[0].limits, costs, strict=True)),
+            "mean_costs": dict(zip((*outcomes[0].limits, "failed episodes"), costs, strict=True)),
         }
     return test
 
@@ -72,13 +72,14 @@ def _beside(test: Mapping[str, Any], name: str, other: str) -> str:
     one, two = test[name], test[other]
     base = two["total_reward"]
     gain = one["total_reward"] - base
-    pairs = zip(one["rewards"].values(), two["rewards"].values(), strict=True)
-    half = confidence(*(np.subtract(*pair).tolist() for pair in pairs))
+    half = confidence(
+        *(np.subtract(own, two["rewards"][key]).tolist() for key, own in one["rewards"].items())
+    )
     is_relative = base * (base + gain) > 0 and abs(gain) < 10 * abs(base)
     scale, unit = (100 / abs(base), " %") if is_relative else (1.0, "")
     size, word = scale * abs(gain), "better" if gain >= 0 else "worse"
     text = f"{size:.3g}{unit} {word} than {other}"
-    if half is not None:
+    if half:
         half *= scale
         text += f" ({size - half:.3g} to {size + half:.3g})"
         text += ", which may be chance," if half >= size else ""

@@ -176,7 +176,8 @@ class Searching:
         if took * _ENOUGH > left:
             who = "policies may hardly gain" if self._is_enough else "only the baseline is tuned"
             self.tell(
-                f"a round of {FEW} candidates takes about {took:.3g} s, so that {who}; for more, "
+                f"a round of {FEW} candidates takes about {took:.3g} s with episodes of "
+                f"{probe.usual_steps} steps, so that {who}; for more, "
                 f"give --minutes {np.ceil(took * _ENOUGH / 60):.0f}"
             )
         limits = {
@@ -184,7 +185,7 @@ class Searching:
             f"until round {self.rounds}": self.rounds,
             f"for at most {self.steps} steps": self.steps,
         }
-        kind = "one episode, as all are the same" if probe.is_same else "new episodes"
+        kind = "one episode (all are the same)" if probe.is_same else "new episodes"
         self.tell(
             f"candidates play {kind} of up to {probe.most_steps} steps, "
             + " and ".join(text for text, limit in limits.items() if limit < np.inf)
@@ -253,7 +254,8 @@ class Searching:
         if not self._is_enough and not found.tuning and found.baseline is None:
             return True
         done, seconds = self._arena.steps - self._before, monotonic() - self._begin
-        pace = seconds / done if done else self._probe.seconds
+        # all episodes may end before they are as long as they may be
+        pace = seconds / (done or 1) * self._arena.longest / self._probe.most_steps
         return seconds + took + self._reserved(found) * pace >= self.seconds
 
     def _text(self) -> str:

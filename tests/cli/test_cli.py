@@ -507,6 +507,21 @@ class TestCommand:
             assert capsys.readouterr().err.split() == told.split(), name
         assert (logger.handlers, logger.level) == before
 
+    @pytest.mark.parametrize(("option", "told"), [(None, 5), ("-v", 12), ("-q", 0)])
+    def test_warnings_of_one_kind_are_told_some_times(self, option, told, capsys):
+        """Those of other places stay, and a line tells how many are left out."""
+        logger = logging.getLogger("fmugym.Some")
+        arguments, _ = _parser()[0].parse_known_args(["bench", "a", *filter(None, [option])])
+        with speaking(arguments):
+            for number in range(10):
+                logger.warning("environment %d fails", number)
+            for number in range(2):
+                logger.warning("another %d", number)
+        err = capsys.readouterr().err.splitlines()
+        assert sum("environment" in line or "another" in line for line in err) == told
+        assert [line for line in err if "7 more" in line and "-v" in line] == err[told:]
+        assert len(err) == told + (option is None)
+
     @pytest.mark.parametrize("program", [["-m", "fmugym"], ["-c", PROGRAM]])
     def test_classes_in_the_working_directory_are_found(self, tmp_path, program):
         """The program ``fmugym`` has its own folder in front, not the working directory."""

@@ -107,6 +107,37 @@ def test_lines_can_be_written_into_the_file(lag, tmp_path, capsys):
     load(tmp_path / "b.toml").close()
 
 
+RESTING = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "2s",
+    "variables": {"tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["theta"]},
+    "parameters": {"m": {"distribution": "uniform", "low": 0.05, "high": 0.1}},
+    "reward": "-(theta**2)",
+}
+
+
+def findings_of(task, check):
+    _, report = advised(Task.from_dict(task))
+    return [one for one in report.findings if one.check == check]
+
+
+def test_a_parameter_has_an_effect_where_an_action_moves_the_process():
+    """Upright, the pendulum stays without a torque, whatever its mass."""
+    (found,) = findings_of(RESTING, "parameters")
+    assert found.verdict == "ok"
+    (found,) = findings_of(RESTING | {"parameters": {"v_c": 0.05}}, "parameters")
+    assert "without an effect: v_c" in found.text
+
+
+@pytest.mark.parametrize("reward", ["log(-1 - theta**2)", {"a": "1", "b": "0.5 / (tau - tau)"}])
+def test_a_reward_that_is_no_number_is_to_be_changed(reward):
+    (found,) = findings_of(RESTING | {"reward": reward}, "run")
+    assert found.verdict == "error"
+    assert ("time step" in found.cure, "division by 0" in found.cure) == (False, True)
+
+
 class TestEpisodeLength:
     """The lag follows as 1 - exp(-t), so with a time constant of 1 s."""
 
@@ -123,6 +154,12 @@ class TestEpisodeLength:
         assert "x follows with a time constant of" in why
         assert found == pytest.approx(0.05 * round(found / 0.05))
         load(lag_task(lag, 1.0, episode_length=found, agent=agent)).close()
+
+    def test_an_episode_that_ends_by_itself_stays(self, lag):
+        """As a batch does, which is not longer for more time."""
+        agent = {"actions": ["u"], "observations": ["x"]}
+        end = {"terminated": "abs(x) > 0.01", "episode_length": 0.5}
+        assert self.length_of(lag_task(lag, 1.0, agent=agent, **end)) == (None, "")
 
     def test_one_that_is_long_enough_stays(self, lag):
         assert self.length_of(lag_task(lag, 1.0)) == (None, "")

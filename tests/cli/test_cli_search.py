@@ -76,6 +76,20 @@ def test_a_folder_is_replaced_only_by_force_and_only_by_a_new_agent(task, tmp_pa
     assert (precious / "file").exists()
 
 
+def test_faults_are_told_where_they_may_decide(tmp_path, searched):
+    """A reward that is NaN beyond some actions; the log tells three of many such episodes."""
+    changes = {"reward": "log(0.09 - tau) - 9", "costs": None, "controllers": {"full": 0.1}}
+    task = written(tmp_path, **changes)
+    code, _, err = searched(task, tmp_path / "agent", "--rounds", "12")
+    test = facts_of(tmp_path / "agent")["test"]
+    parts = {name: one["mean_costs"]["failed episodes"] for name, one in test.items()}
+    assert code == 0
+    assert parts.pop("full") == 1.0
+    assert [*parts.values()] == [0.0]
+    assert "full 100 %" in err
+    assert err.count("nan, where") == 3
+
+
 def written(tmp_path, name="task", **changes):
     document = {key: value for key, value in (TASK | changes).items() if value is not None}
     path = tmp_path / f"{name}.toml"
@@ -486,6 +500,7 @@ class TestVerdict:
     @pytest.mark.parametrize(
         ("new", "old", "facts", "missing"),
         [
+            ([-90] * 3, [-100] * 3, ["10 % better than old in"], ["(", "chance"]),
             ([-90, -91, -89], [-100, -101, -99], ["10 % better than old"], ["chance"]),
             ([110, 111, 109], [100, 101, 99], ["10 % better than old"], ["chance"]),
             ([-110, -111, -109], [-100, -101, -99], ["10 % worse than old"], ["chance"]),

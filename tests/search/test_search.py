@@ -224,7 +224,8 @@ class TestArena:
         costs = ["turns", "effort"]
         outcome, _ = played(load(), limits=dict.fromkeys(costs, 1.0))
         assert outcome.returns.shape == (5, 3)
-        assert outcome.costs.shape == (5, 3, 2)
+        assert outcome.costs.shape == (5, 3, 3)
+        assert not outcome.costs[..., 2].any()  # no faults
         lengths = set()
         with closing(load()()) as env:
             for row, (gain,) in enumerate(GAINS):
@@ -234,7 +235,7 @@ class TestArena:
                     total, cost, length = episode(env, controller, seed, costs)
                     lengths.add(length)
                     assert outcome.returns[row, column] == total
-                    assert outcome.costs[row, column].tolist() == cost
+                    assert outcome.costs[row, column, :2].tolist() == cost
         assert len(lengths) > 3  # some have ended before others
 
     def test_environments_are_not_opened_again_and_again(self):
@@ -316,14 +317,51 @@ NOTHING = np.empty(0)
 
 
 def test_costs_beyond_their_limits_come_first():
-    """Returns 5, 9, 7, 1; two costs, of which the second has no room at all."""
-    costs = np.array([[[1.0, 0.0]], [[4.0, 0.0]], [[2.0, 0.5]], [[2.0, -1.0]]])
+    """Returns 5, 9, 7, 1; two costs, of which the second has no room at all; no faults."""
+    costs = np.array([[[1.0, 0.0, 0]], [[4.0, 0.0, 0]], [[2.0, 0.5, 0]], [[2.0, -1.0, 0]]])
     returns = np.array([[5.0], [9.0], [7.0], [1.0]])
     merits = Outcome(returns, costs, {"a": 2.0, "b": 0.0}, NOTHING).merits
     assert merits == [(0.0, 5.0), (-1.0, 9.0), (-0.5, 7.0), (0.0, 1.0)]
     assert sorted(range(4), key=merits.__getitem__, reverse=True) == [0, 3, 2, 1]
-    without = Outcome(returns, costs[..., :0], {}, NOTHING).merits
+    without = Outcome(returns, costs[..., 2:], {}, NOTHING).merits
     assert [merit for _, merit in without] == [5, 9, 7, 1]
+
+
+def test_what_is_no_number_comes_last():
+    """Neither a NaN among the rewards nor one among the costs has an order."""
+    returns = np.array([[np.nan, 9.0], [-1e9, -1e9], [7.0, 7.0], [1.0, 1.0]])
+    costs = np.array([[[0.0, 0]] * 2, [[9.0, 0]] * 2, [[np.nan, 0], [0, 0]], [[0.0, 0]] * 2])
+    merits = Outcome(returns, costs, {"a": 1.0}, NOTHING).merits
+    for order in itertools.permutations(range(4)):
+        assert sorted(order, key=merits.__getitem__, reverse=True)[:2] == [3, 1]
+
+
+def test_a_search_among_what_is_no_number_goes_on():
+    """All its first candidates reach NaN."""
+    rng = np.random.default_rng(0)
+    entrant = Entrant(CMA(np.zeros(2), 1.0, 8, rng), Agent("own"), 2)
+    for most in (np.nan, 1.0):
+        for _ in range(5):
+            entrant.play(Field(most), range(2))
+        entrant.validate(Field(most), range(2))
+        assert entrant.best is not None
+    assert np.isfinite(entrant.merit).all()
+    assert entrant.best.weights.shape == (2,)
+
+
+@pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
+def test_faults_come_last_where_they_are_no_end(on_fault):
+    """A reward that is NaN ends the episode, which saves it the other ones, all of them negative.
+
+    Where faults are an end, their reward counts. Here it is the lowest of the episode.
+    """
+    changes = {"reward": "log(0.05 - tau) - 9", "config": {"on_fault": on_fault}, "costs": None}
+    weights = np.array([[1.0], [-1.0], [-0.5]])
+    outcome, _ = played(load(**changes), Agent("own", acting=1), weights)
+    is_end = on_fault == "terminate"
+    assert outcome.costs[..., -1].tolist() == [[0.0 if is_end else 1.0] * 3, [0.0] * 3, [0.0] * 3]
+    order = sorted(range(3), key=outcome.merits.__getitem__, reverse=True)
+    assert order[0 if is_end else -1] == 0
 
 
 class Stub:
@@ -729,7 +767,7 @@ class Field:
     def play(self, make, numbers, seeds, has_moments=False):
         returns = np.repeat(np.minimum(numbers.sum(axis=1), self.most)[:, None], len(seeds), axis=1)
         seen = np.ones((*returns.shape, 1 + 2 * 7))
-        return Outcome(returns, np.empty((*returns.shape, 0)), {}, seen)
+        return Outcome(returns, np.zeros((*returns.shape, 1)), {}, seen)
 
 
 class Needle(Field):
@@ -739,7 +777,7 @@ class Needle(Field):
         near = np.maximum(0.0, 1.0 - np.linalg.norm(numbers - 1.0, axis=1))
         chance = np.random.default_rng(list(seeds)).normal(0.0, 1e-3, (len(numbers), len(seeds)))
         returns = near[:, None] + chance
-        return Outcome(returns, np.empty((*returns.shape, 0)), {}, NOTHING)
+        return Outcome(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
 
 
 def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
@@ -773,7 +811,7 @@ class Noisy:
 
     def play(self, make, numbers, seeds, has_moments=False):
         returns = numbers + self.rng.normal(0.0, self.noise, (400, len(seeds)))
-        return Outcome(returns, np.empty((*returns.shape, 0)), {}, NOTHING)
+        return Outcome(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
 
 
 @pytest.mark.parametrize(
@@ -1282,6 +1320,14 @@ class TestBudget:
         assert content(tmp_path / "b") == content(tmp_path / "a")
         assert again["test"] == facts["test"]
 
+    def test_episodes_that_end_early_leave_it_time(self, tmp_path, monkeypatch):
+        """They take 9 steps of 10,000, and so does the last validation."""
+        early = {"terminated": "n >= 9", "memory": COUNTED, "episode_length": "500s"}
+        with monkeypatch.context() as patch:
+            budget = Budget(patch)
+            searched(tmp_path / "a", rounds=np.inf, minutes=4 / 60, **early)
+        assert 0.7 * 4 < 1e-4 * budget.steps <= 4
+
     def test_of_slow_fmus_only_the_baseline_is_tuned(self, tmp_path, monkeypatch):
         """A round of 8 candidates takes 1 s, of which 3 s have less than 20."""
         told = []
@@ -1300,6 +1346,7 @@ class TestBudget:
 
 
 HIDDEN = {"q_0": "pi", "theta_0": 0.5, "b": {"distribution": "uniform", "low": 0.1, "high": 1}}
+COUNTED = {"n": {"start": 0, "update": "n + 1"}}
 
 
 class TestProbe:
@@ -1315,3 +1362,21 @@ class TestProbe:
         assert slow.seconds > fast.seconds
         assert replace(slow, seconds=fast.seconds) == fast
         assert (slow.is_same, slow.only_return) == (False, None)
+
+    @pytest.mark.parametrize(("end", "steps"), [("n >= 9", 9), ("n > 99", 40), (None, 40)])
+    def test_a_round_takes_as_long_as_episodes_have_taken(self, end, steps):
+        probe = Probe.of(load(terminated=end, memory=COUNTED), 8)
+        assert probe.round_time(4) == pytest.approx(probe.seconds * steps * 8 * 4)
+
+    def test_of_longer_episodes_the_limit_counts(self):
+        probe = Probe.of(load(terminated=None, episode_length="10s"), 8)
+        assert probe.round_time(1) == pytest.approx(probe.seconds * 200 * 8)
+
+    def test_a_reward_that_is_always_nan_is_refused(self, tmp_path):
+        reward = {"fine": "-theta**2", "wrong": "log(-1 - tau**2)"}
+        with pytest.raises(ConfigError, match=r"reward\.wrong.*log\(-1 - tau\*\*2\).*validate"):
+            searched(tmp_path / "agent", reward=reward)
+        assert not (tmp_path / "agent").exists()
+
+    def test_a_reward_that_is_nan_later_is_none_of_its_business(self):
+        Probe.of(load(reward="log(1.5 - n)", memory=COUNTED), 8)
