@@ -41,11 +41,12 @@ def told(faults: Mapping[str, str]) -> str:
     return "; ".join(f"{', '.join(own)}: {why}" for why, own in names.items())
 
 
-@dataclass
+@dataclass(eq=False)
 class Feed:
     """The values of a plant at its ticks, which lie on multiples of the time step.
 
-    It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing.
+    It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing, and the
+    start time of episodes.
 
     Args:
         clock: The monotonic clock of ticks and readings.
@@ -72,8 +73,6 @@ class Feed:
         self,
         plant: Plant,
         poller: Poller,
-        samplings: Mapping[str, str],
-        read: Callable[[], Mapping[str, float]],
         live: Live,
     ) -> None:
         """Begin to read.
@@ -81,24 +80,38 @@ class Feed:
         Args:
             plant: Has the tags.
             poller: Reads them.
-            samplings: How tags are sampled within a step, where that is not ``"last"``.
-            read: Returns the outputs in the FMU's units by name, from ``values``.
             live: Gets the data of each tick.
         """
-        self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
-        self._live = live
+        self._plant, self._poller, self._live = plant, poller, live
         self._asked = dict.fromkeys(plant.tags, -np.inf)
         self._ahead, self._has_begun = 0.0, False
+
+    def row(self) -> dict[str, float]:
+        """What the FMU's variables have at this tick, in its units, by name."""
+        return {
+            tag.variable.name: tag.to_task.inverse(self.values[name][0])
+            for name, tag in self._plant.tags.items()
+            if tag.variable
+        }
+
+    def held(self) -> list[str]:
+        """The names of the FMU's variables whose last values go on."""
+        tags = [self._plant.tags.get(name) for name in self.faults]
+        return [tag.variable.name for tag in tags if tag and tag.variable]
+
+    def sample(self, rng: np.random.Generator) -> float:
+        """Return when an episode begins: at the present tick."""
+        return self.time
 
     # The backend.
 
     def reset(self, start_values: Mapping[str, Any]) -> Mapping[str, float]:
         """Set nothing."""
-        return self._read()
+        return self.row()
 
     def step(self, inputs: Mapping[str, float]) -> tuple[Mapping[str, float], int]:
         """Write nothing."""
-        return self._read(), Status.OK
+        return self.row(), Status.OK
 
     def stop(self) -> None:
         """Do nothing: the plant goes on."""
@@ -193,7 +206,7 @@ class Feed:
 
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
         """What a step gives of its readings, a row for each."""
-        how = self._samplings.get(name, "last")
+        how = self._plant.tags[name].sampling
         found = _SAMPLED[how](numbers)
         if how == "integral":
             found = found * self._plant.step

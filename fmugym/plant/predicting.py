@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmugym.archive.units import Conversion
 from fmugym.baselines.observer import COPIES, Observer, spread
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant, tagged
+from fmugym.plant.tags import Plant, Tag
 from fmugym.plant.written import Written
 from fmugym.pool.base import FloatArray
 
@@ -60,10 +59,10 @@ class Predictions:
         self.envs: list[TaskEnv] = []
         self._written: list[Written] = []
         self._spread: dict[str, FloatArray] = {}
-        self._tags: list[tuple[int, str, Conversion]] = []
+        self._tags: list[Tag] = []
         if steps:
             self._make(make_env)
-        self.names = [alias for _, alias, _ in self._tags]
+        self.names = [tag.name for tag in self._tags]
         shape = (steps, len(self.names))
         self._sums, self._squares = np.zeros(shape), np.zeros(shape)
         self._counts = np.zeros(shape, np.int64)
@@ -75,17 +74,14 @@ class Predictions:
         for _ in range(COPIES - 1 if self._spread else 0):
             self.envs.append(make_env())
         self._written = [Written(env, self._feed, self._plant) for env in self.envs]
-        self._tags = tagged(self.envs[0], self._plant, self.envs[0].inside.spec.outputs)
+        self._tags = self._plant.of(self.envs[0].inside.spec.outputs)
 
     def _measured(self) -> FloatArray:
         return np.array([self._feed.values[name][0] for name in self.names])
 
     def _seen(self) -> FloatArray:
         """What the copies give, shape (n, k)."""
-        outputs = self.envs[0].inside.spec.outputs
-        return np.array(
-            [[c(env.out[outputs[k].name]) for k, _, c in self._tags] for env in self.envs]
-        )
+        return np.array([[tag.of_fmu(env.out) for tag in self._tags] for env in self.envs])
 
     def begin(self) -> None:
         """Begin with the offsets that the plant has now."""

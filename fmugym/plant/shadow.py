@@ -23,8 +23,8 @@ from fmugym.plant.opcua import OpcUaClient
 from fmugym.plant.polling import Poller
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
-from fmugym.plant.tags import DATA, Plant, read_plant, tagged
-from fmugym.plant.written import Written, lacking_tag
+from fmugym.plant.tags import DATA, read_plant
+from fmugym.plant.written import Written
 from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 from fmugym.task.warm_up import WarmUp, WarmUps
 
@@ -33,20 +33,9 @@ __all__ = ["Shadow", "connect"]
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
 
-class _PresentTime:
-    """The start time of an episode: that of the plant."""
-
-    def __init__(self, feed: Feed) -> None:
-        self._feed = feed
-
-    def sample(self, rng: np.random.Generator) -> float:
-        """Return the time of the present tick, in seconds of the year."""
-        return self._feed.time
-
-
 def _watched(task: Task, feed: Feed) -> Task:
     """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
-    task = on_time_of_year(endless(task), _PresentTime(feed))
+    task = on_time_of_year(endless(task), feed)
     document = dict(task.document)
     variables = document.get("variables", {})
     document["variables"] = {
@@ -201,7 +190,9 @@ def connect(
         env = stack.enter_context(closing(environment(own, backend=feed)))
         plant = read_plant(env, address)
         written = Written(env, feed, plant)
-        read, env.inside.held, samplings = _reading(env, feed, plant)
+        for output in env.inside.spec.outputs:
+            plant.require(output)
+        env.inside.held = feed.held
         _watch_warm_up(env, feed, written)
         model = watched.physical()
         env.inside.model = partial(load, model)
@@ -216,8 +207,7 @@ def connect(
         client = _CLIENTS[plant["protocol"]](plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
-        samplings |= dict.fromkeys(written.names, "median")
-        feed.open(plant, poller, samplings, read, live)
+        feed.open(plant, poller, live)
         return Shadow(env, feed, written, copies, stack.pop_all())
 
 
@@ -233,23 +223,3 @@ def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
     if env.inside.warm_ups is not None:
         watching = _Watching(env.inside.warm_ups.warm_up, feed, written)
         env.inside.warm_ups = WarmUps(env, watching)
-
-
-def _reading(
-    env: TaskEnv, feed: Feed, plant: Plant
-) -> tuple[Callable[[], Mapping[str, float]], Callable[[], list[str]], dict[str, str]]:
-    """What reads all that the task reads, in the FMU's units; what of it holds; its samplings."""
-    outputs = env.inside.spec.outputs
-    found = tagged(env, plant, outputs)
-    known = {place for place, *_ in found}
-    for place, one in enumerate(outputs):
-        if place not in known:
-            raise lacking_tag(one.name)
-
-    def read() -> dict[str, float]:
-        return {outputs[k].name: own.inverse(feed.values[alias][0]) for k, alias, own in found}
-
-    def held() -> list[str]:
-        return [outputs[k].name for k, alias, _ in found if alias in feed.faults]
-
-    return read, held, {alias: outputs[k].sampling for k, alias, _ in found}
