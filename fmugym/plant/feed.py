@@ -55,7 +55,7 @@ class Feed:
     Attributes:
         values: The present values of the tags, in the task's units.
         faults: What is wrong, by the names of tags whose last value goes on.
-        expired: The names of those whose last value has held for too long.
+        has_expired: Whether the last value of one has held for too long.
         time: The plant's time at the present tick.
         jump: By how much the plant's time has jumped, in seconds.
     """
@@ -64,7 +64,7 @@ class Feed:
     wall: Callable[[], float]
     values: dict[str, tuple[float, ...]] = field(default_factory=dict)
     faults: dict[str, str] = field(default_factory=dict)
-    expired: tuple[str, ...] = ()
+    has_expired: bool = False
     time: float = 0.0
     jump: float = 0.0
     samples_outputs = True
@@ -131,7 +131,7 @@ class Feed:
         self.time, self.jump = now + (-now % step), 0.0
         self._live.begin()
         self._sleep()
-        if self.expired and not self._has_begun:
+        if self.has_expired and not self._has_begun:
             raise SimulationError(self._told())
         self._has_begun = True
 
@@ -177,7 +177,7 @@ class Feed:
         self._look(tick - self._plant.step, tick)
         faults = self._live.refresh(self.time, self.values)
         self.faults |= faults
-        self.expired += tuple(faults)
+        self.has_expired |= bool(faults)
 
     def _seen_ahead(self) -> float:
         """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
@@ -187,7 +187,7 @@ class Feed:
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
-        self.faults, expired = {}, []
+        self.faults, self.has_expired = {}, False
         rounds = self._poller.take(end)
         for name, asked in self._asked.items():
             good = [one for one in rounds if not one.answers[name].fault]
@@ -201,8 +201,7 @@ class Feed:
                 why = self._poller.trouble(name) or "no answer has come in time"
                 self.faults[name] = f"{why} (for {age:.6g} s)" if name in self.values else why
             if age > self._plant.stale_after + self._plant.hold:
-                expired.append(name)
-        self.expired = tuple(expired)
+                self.has_expired = True
 
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
         """What a step gives of its readings, a row for each."""

@@ -15,6 +15,7 @@ import numpy as np
 from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
+from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
 from fmugym.plant.feed import Feed, local_time, told
 from fmugym.plant.live import Live
@@ -26,7 +27,6 @@ from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA, read_plant
 from fmugym.plant.written import Written
 from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
-from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect"]
 
@@ -36,19 +36,7 @@ _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClie
 def _watched(task: Task, feed: Feed) -> Task:
     """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
     task = on_time_of_year(endless(task), feed)
-    document = dict(task.document)
-    variables = document.get("variables", {})
-    document["variables"] = {
-        alias: {key: value for key, value in given.items() if key not in DEVICE}
-        for alias, given in variables.items()
-    }
-    agent = dict(document.get("agent", {}))
-    if "forecast" in agent:
-        given = agent["forecast"]
-        agent["forecast"] = [
-            {k: v for k, v in one.items() if k != "error"} for one in _listed(given)
-        ]
-    return replace(task, document={**document, "agent": agent})
+    return replace(task, document=ideal(task.document, DEVICE))
 
 
 def _with_past(task: Task) -> Task:
@@ -56,35 +44,11 @@ def _with_past(task: Task) -> Task:
     agent = task.document.get("agent", {})
     if "history" not in agent:
         return task
-    held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
+    actions = agent["actions"]
+    actions = [actions] if isinstance(actions, str) else actions
+    held = dict.fromkeys(actions, 0.0)  # what acts in the plant is known then
     warm_up = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**task.document, "warm_up": warm_up})
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else [value]
-
-
-class _Watching(WarmUp):
-    """Fills histories: the steps before the first observation, with what acts in the plant."""
-
-    def __init__(self, declared: WarmUp, feed: Feed, written: Written) -> None:
-        self.steps, self.writes = declared.steps, declared.writes
-        self._declared, self._feed, self._written = declared, feed, written
-
-    def begin(self, count: int) -> None:
-        """See ``WarmUp.begin``."""
-        self._declared.begin(count)
-
-    def inputs(self, env: Any) -> Any:
-        """See ``WarmUp.inputs``: wait, and see what has acted."""
-        values = self._declared.inputs(env)
-        self._feed.advance()
-        return self._written.over(np.array([np.ravel(value)[0] for value in values]))
-
-    def update(self, env: Any) -> None:
-        """See ``WarmUp.update``."""
-        self._declared.update(env)
 
 
 class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -134,7 +98,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Wait for the next tick; see the class."""
-        if not self._feed.expired:
+        if not self._feed.has_expired:
             self._proposed = self._written.proposed(action)
         self._feed.advance()
         observation, reward, terminated, truncated, info = self.env.step(self._written.action())
@@ -193,7 +157,7 @@ def connect(
         for output in env.inside.spec.outputs:
             plant.require(output)
         env.inside.held = feed.held
-        _watch_warm_up(env, feed, written)
+        _fill_histories(env, feed, written)
         model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(
@@ -202,8 +166,7 @@ def connect(
             plant,
             int(ahead / plant.step + 1e-9),
         )
-        live = Live(env, plant)
-        live.envs += copies.envs
+        live = Live([env, *copies.envs], plant)
         client = _CLIENTS[plant["protocol"]](plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
@@ -219,7 +182,16 @@ def _wall(clock: Clock) -> Callable[[], float]:
     return lambda: start + clock.time()
 
 
-def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
-    if env.inside.warm_ups is not None:
-        watching = _Watching(env.inside.warm_ups.warm_up, feed, written)
-        env.inside.warm_ups = WarmUps(env, watching)
+def _fill_histories(env: TaskEnv, feed: Feed, written: Written) -> None:
+    """Let steps before the first observation wait, and see what has acted."""
+    if env.inside.warm_ups is None:
+        return
+    warm_up = env.inside.warm_ups.warm_up
+    declared = warm_up.inputs
+
+    def inputs(env: Any) -> Any:
+        values = declared(env)
+        feed.advance()
+        return written.over(np.array([np.ravel(value)[0] for value in values]))
+
+    warm_up.inputs = inputs  # type: ignore[method-assign]  # of this one environment
