@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock, speed_of
 from fmugym.pool.base import FloatArray
 
-__all__ = ["Feed", "local_time", "told"]
+__all__ = ["Feed", "told"]
 
 _LEAST_JUMP: Final = 60.0
 """Clocks that are apart by less, in seconds, have not jumped."""
@@ -27,7 +27,7 @@ _LATE: Final = 2.0
 """How late a thread or an answer may be, in seconds of real time."""
 
 
-def local_time() -> float:
+def _local_time() -> float:
     """The seconds since the beginning of the year, in the time of this place."""
     now = datetime.datetime.now()
     return (now - datetime.datetime(now.year, 1, 1)).total_seconds()
@@ -41,7 +41,6 @@ def told(faults: Mapping[str, str]) -> str:
     return "; ".join(f"{', '.join(own)}: {why}" for why, own in names.items())
 
 
-@dataclass(eq=False)
 class Feed:
     """The values of a plant at its ticks, which lie on multiples of the time step.
 
@@ -50,7 +49,6 @@ class Feed:
 
     Args:
         clock: The monotonic clock of ticks and readings.
-        wall: Gives the plant's time in seconds of the year, unless there is a tag for it.
 
     Attributes:
         values: The present values of the tags, in the task's units.
@@ -60,21 +58,15 @@ class Feed:
         jump: By how much the plant's time has jumped, in seconds.
     """
 
-    clock: Clock
-    wall: Callable[[], float]
-    values: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    faults: dict[str, str] = field(default_factory=dict)
-    has_expired: bool = False
-    time: float = 0.0
-    jump: float = 0.0
     samples_outputs = True
 
-    def open(
-        self,
-        plant: Plant,
-        poller: Poller,
-        live: Live,
-    ) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self._start = clock, _local_time() - clock.time()
+        self.values: dict[str, tuple[float, ...]] = {}
+        self.faults: dict[str, str] = {}
+        self.has_expired, self.time, self.jump = False, 0.0, 0.0
+
+    def open(self, plant: Plant, poller: Poller, live: Live) -> None:
         """Begin to read.
 
         Args:
@@ -181,9 +173,11 @@ class Feed:
 
     def _seen_ahead(self) -> float:
         """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
-        if "clock" not in self._asked:
-            return self.wall() - self.clock.time()
-        return self.values["clock"][0] - self._asked["clock"]
+        if "clock" in self._asked:
+            return self.values["clock"][0] - self._asked["clock"]
+        if speed_of(self.clock) == 1.0:
+            return _local_time() - self.clock.time()
+        return self._start  # a clock that runs faster began with the time of this place
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
@@ -206,17 +200,16 @@ class Feed:
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
         """What a step gives of its readings, a row for each."""
         how = self._plant.tags[name].sampling
-        found = _SAMPLED[how](numbers)
+        found = numbers[-1] if how == "last" else _SAMPLED[how](numbers, axis=0)
         if how == "integral":
             found = found * self._plant.step
-        return tuple(np.ravel(found).tolist())
+        return tuple(found.tolist())
 
 
-_SAMPLED: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "last": lambda numbers: numbers[-1],
-    "mean": lambda numbers: numbers.mean(axis=0),
-    "integral": lambda numbers: numbers.mean(axis=0),
-    "min": lambda numbers: numbers.min(axis=0),
-    "max": lambda numbers: numbers.max(axis=0),
-    "median": lambda numbers: np.sort(numbers, axis=0)[len(numbers) // 2],
+_SAMPLED: Final[Mapping[str, Callable[..., Any]]] = {
+    "mean": np.mean,
+    "integral": np.mean,
+    "min": np.min,
+    "max": np.max,
+    "median": partial(np.quantile, q=0.5, method="higher"),  # one of the readings
 }

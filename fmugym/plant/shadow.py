@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
@@ -17,7 +17,7 @@ from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
-from fmugym.plant.feed import Feed, local_time, told
+from fmugym.plant.feed import Feed, told
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
@@ -26,7 +26,7 @@ from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA, read_plant
 from fmugym.plant.written import Written
-from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
+from fmugym.pool.backend.clocks import Clock, RealClock
 
 __all__ = ["Shadow", "connect"]
 
@@ -91,10 +91,8 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         self._feed.begin()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._copies.begin()
         self._proposed = dict.fromkeys(self._written.names, math.nan)
-        predicted = dict.fromkeys(self._copies.names, math.nan)
-        return observation, info | self._told(predicted)
+        return observation, info | self._told(self._copies.begin())
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Wait for the next tick; see the class."""
@@ -147,7 +145,7 @@ def connect(
             ``plant`` is missing.
     """
     task, clock = Task.of(config), clock or RealClock()
-    feed = Feed(clock, _wall(clock))
+    feed = Feed(clock)
     watched = _watched(task, feed)
     own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
@@ -172,14 +170,6 @@ def connect(
         stack.callback(poller.stop)
         feed.open(plant, poller, live)
         return Shadow(env, feed, written, copies, stack.pop_all())
-
-
-def _wall(clock: Clock) -> Callable[[], float]:
-    """The time of this place; if a clock runs faster, it began with that."""
-    if speed_of(clock) == 1.0:
-        return local_time
-    start = local_time() - clock.time()
-    return lambda: start + clock.time()
 
 
 def _fill_histories(env: TaskEnv, feed: Feed, written: Written) -> None:
