@@ -118,7 +118,6 @@ class ModbusClient:
 
     def __init__(self, plant: Plant) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
-        self._errors = imported("pymodbus.exceptions", "plant")
         self._codes = imported("pymodbus.constants", "plant").ExcCodes
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
@@ -167,12 +166,7 @@ class ModbusClient:
         cells: list[Any] = []
         for begin in range(place.begin, place.end, _MOST):
             count = min(_MOST, place.end - begin)
-            try:
-                told = await ask(begin, count=count, device_id=place.unit_id)
-            except self._errors.ConnectionException:
-                raise LostError("the connection is lost") from None
-            except self._errors.ModbusException:
-                raise LostError("it does not answer, or not by Modbus") from None
+            told = await ask(begin, count=count, device_id=place.unit_id)
             if told.isError():
                 known, code = {one.value: one.name for one in self._codes}, told.exception_code
                 where = f"{place.kind} {begin} of unit {place.unit_id}"
