@@ -18,7 +18,7 @@ from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock, speed_of
 from fmugym.pool.base import FloatArray
 
-__all__ = ["Feed", "told"]
+__all__ = ["Feed"]
 
 _LEAST_JUMP: Final = 60.0
 """Clocks that are apart by less, in seconds, have not jumped."""
@@ -31,14 +31,6 @@ def _local_time() -> float:
     """The seconds since the beginning of the year, in the time of this place."""
     now = datetime.datetime.now()
     return (now - datetime.datetime(now.year, 1, 1)).total_seconds()
-
-
-def told(faults: Mapping[str, str]) -> str:
-    """What is wrong, in words; tags of which the same is wrong stand together."""
-    names: dict[str, list[str]] = {}
-    for name, why in faults.items():
-        names.setdefault(why, []).append(name)
-    return "; ".join(f"{', '.join(own)}: {why}" for why, own in names.items())
 
 
 class Feed:
@@ -90,6 +82,16 @@ class Feed:
         """The names of the FMU's variables whose last values go on."""
         tags = [self._plant.tags.get(name) for name in self.faults]
         return [tag.variable.name for tag in tags if tag and tag.variable]
+
+    def told(self) -> str:
+        """What is wrong, in words; tags of which the same is wrong stand together."""
+        names: dict[str, list[str]] = {}
+        for name, why in self.faults.items():
+            names.setdefault(why, []).append(name)
+        texts = [f"{', '.join(own)}: {why}" for why, own in names.items()]
+        if self.jump:
+            texts.append(f"the plant's clock has jumped by {self.jump:.6g} s")
+        return "; ".join(texts)
 
     def sample(self, rng: np.random.Generator) -> float:
         """Return when an episode begins: at the present tick."""
@@ -145,7 +147,7 @@ class Feed:
                 raise SimulationError(self._told())
 
     def _told(self) -> str:
-        return f"the plant at {self._plant.address}: {told(self.faults)}"
+        return f"the plant at {self._plant.address}: {self.told()}"
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""

@@ -140,22 +140,13 @@ class ModbusClient:
         """See ``polling.Client``."""
         found: dict[str, Answer] = {}
         for block in self._blocks:
-            found |= await self._read(block)
-        return found
-
-    async def _read(self, block: Sequence[_Place]) -> dict[str, Answer]:
-        begin, whole = block[0].begin, block[0]._replace(end=block[-1].end)
-        cells, fault = await self._ask(whole)
-        if not fault:
-            return {
-                one.tag.name: _answer(one, cells[one.begin - begin : one.end - begin])
-                for one in block
-            }
-        if len(block) == 1:
-            return {block[0].tag.name: Answer((), fault)}
-        found: dict[str, Answer] = {}
-        for one in block:  # one of them may be the reason
-            found |= await self._read([one])
+            begin = block[0].begin
+            whole, fault = await self._ask(block[0]._replace(end=block[-1].end))
+            for one in block:
+                cells, why = whole[one.begin - begin : one.end - begin], fault
+                if fault and len(block) > 1:  # another one may be the reason
+                    cells, why = await self._ask(one)
+                found[one.tag.name] = Answer((), why) if why else _answer(one, cells)
         return found
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:

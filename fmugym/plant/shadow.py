@@ -17,7 +17,7 @@ from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
-from fmugym.plant.feed import Feed, told
+from fmugym.plant.feed import Feed
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
@@ -105,13 +105,10 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _told(self, predicted: dict[str, float]) -> dict[str, Any]:
-        feed = self._feed
-        faults = [told(feed.faults)] if feed.faults else []
-        if feed.jump:
-            faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
-        info: dict[str, Any] = {"proposed": self._proposed, "predicted": predicted}
-        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.faults)
-        return info | ({"fault": "; ".join(faults)} if faults else {})
+        missing = tuple(name.removeprefix(DATA) for name in self._feed.faults)
+        info = {"proposed": self._proposed, "predicted": predicted, "missing": missing}
+        fault = self._feed.told()
+        return info | ({"fault": fault} if fault else {})
 
     def close(self) -> None:
         """End the connection."""

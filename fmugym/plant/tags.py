@@ -126,8 +126,8 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
     others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
     for name, one in entry.child("tags").items().items():
         if name in known:
-            limits = {"low": known[name].low, "high": known[name].high}
-            yield _tag(env, name, one, known[name].unit, **limits, **_in_fmu(env, name))
+            low, high = known[name].low, known[name].high
+            yield _tag(env, name, one, known[name].unit, low=low, high=high, **_in_fmu(env, name))
         elif name not in others:  # the task does not read the others
             raise one.error(unknown_name("variable of the task", name, [*known, *others]))
     if entry.child("clock").value is not None:
@@ -142,13 +142,13 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
 def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
     """What a tag says of the variable of the FMU, if the task writes or reads one by this name."""
     own, unit = declared_as(env, name)
-    found = {}
-    for variables, sampling in ((env.inside.spec.inputs, "median"), (env.inside.spec.outputs, "")):
-        for one in variables:
-            if one.name == own:
-                to_task = conversion_between(one.unit, unit, env.fmu.description.units)
-                found = {"variable": one, "to_task": to_task, "sampling": sampling or one.sampling}
-    return found
+    spec = env.inside.spec
+    for one in (*spec.outputs, *spec.inputs):
+        if one.name == own:
+            to_task = conversion_between(one.unit, unit, env.fmu.description.units)
+            sampling = "median" if one in spec.inputs else one.sampling
+            return {"variable": one, "to_task": to_task, "sampling": sampling}
+    return {}
 
 
 def _tag(env: TaskEnv, name: str, entry: Entry, unit: str, **others: Any) -> Tag:
