@@ -12,7 +12,7 @@ import numpy as np
 from fmugym.baselines.observer import COPIES, Observer, spread
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant, Tag
+from fmugym.plant.tags import Plant
 from fmugym.plant.written import Written
 from fmugym.pool.base import FloatArray
 
@@ -56,25 +56,16 @@ class Predictions:
     def __init__(
         self, make_env: Callable[[], TaskEnv], feed: Feed, plant: Plant, steps: int
     ) -> None:
-        self._feed, self._plant, self._steps = feed, plant, steps
-        self.envs: list[TaskEnv] = []
-        self._written: list[Written] = []
-        self._spread: dict[str, FloatArray] = {}
-        self._tags: list[Tag] = []
-        if steps:
-            self._make(make_env)
+        self._feed, self._plant = feed, plant
+        self.envs = [make_env()] if steps else []
+        self._spread = spread(self.envs[0], 0) if steps else {}
+        self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
+        self._written = [Written(env, feed, plant) for env in self.envs]
+        self._tags = plant.of(self.envs[0].inside.spec.outputs) if steps else []
         self.names = [tag.name for tag in self._tags]
         # of the errors, by horizon and variable: how many, their sum, and that of their squares
         self._sums = np.zeros((3, steps, len(self.names)))
         self._told: deque[tuple[int, FloatArray]] = deque(maxlen=max(steps, 1))
-
-    def _make(self, make_env: Callable[[], TaskEnv]) -> None:
-        self.envs.append(make_env())
-        self._spread = spread(self.envs[0], 0)
-        for _ in range(COPIES - 1 if self._spread else 0):
-            self.envs.append(make_env())
-        self._written = [Written(env, self._feed, self._plant) for env in self.envs]
-        self._tags = self._plant.of(self.envs[0].inside.spec.outputs)
 
     def _measured(self) -> FloatArray:
         return np.array([self._feed.values[name][0] for name in self.names])

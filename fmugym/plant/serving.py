@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -201,11 +200,11 @@ class Server:
         self._task, self._port = endless(Task.of(config)), port
         self._player = _player_of(player) if isinstance(player, str) else player
         self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
-        self.address, self._is_bound = "", threading.Event()
+        self.address = ""
         self.summary: Callable[[], Summary]
         self._background = Background(self._serve, "plant server")
-        while not self._is_bound.wait(0.01) and not self._background.is_over:
-            pass
+        while not (self.address or self._background.is_over):
+            self._background.join(0.01)
         self._raise()
 
     async def _serve(self) -> None:
@@ -217,7 +216,6 @@ class Server:
             self.summary = twin.summary
             serve = _SERVERS[plant["protocol"]]
             async with serve(plant, self._port, twin.values) as self.address:
-                self._is_bound.set()
                 pause = plant.step / 2 / speed_of(self._clock)
                 is_over = False
                 while not is_over:
