@@ -30,6 +30,7 @@ from fmugym.identification.statistics import (
 )
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.starting import start_variable
 
 __all__ = ["Limits", "Problem"]
 
@@ -117,20 +118,17 @@ class Problem:
         self.trajectories = experiment.clean(trajectories)
         self._state_names = list(experiment.initial_states)
         self._states = _measured_states(experiment.initial_states, self.trajectories)
-        self._advance = experiment.advance
         self._counted = [_counted(t, experiment) for t in self.trajectories]
         names = [*parameters, *self._state_names]
         self._rows = range(len(names) if fit_states else len(parameters))
-        self._simulator = Simulator(experiment, self.trajectories, names, 1 + len(self._rows))
-        try:
-            self._set_limits([*map(experiment.fmu.variable, names)], parameters)
-            outputs = self._simulator.outputs
-            self._scales = _scales(experiment.scales, self.trajectories, outputs)
-            self._given = [name in experiment.scales for name in outputs]
-        except BaseException:
-            self.close()
-            raise
+        variables = [_settable(experiment, name) for name in names]
+        self._set_limits(variables, parameters)
+        outputs = list(self.trajectories[0].outputs)
+        self._scales = _scales(experiment.scales, self.trajectories, outputs)
+        self._given = [name in experiment.scales for name in outputs]
         self._last = np.empty(0), self._states
+        count = 1 + len(self._rows)
+        self._simulator = Simulator(experiment, self.trajectories, variables, count)
 
     def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
         count = len(parameters)
@@ -203,12 +201,6 @@ class Problem:
         points[:, 0] = self.start
         return list(points[:, np.argsort(self._costs(points))[:DESCENTS]].T)
 
-    def _simulate(self, values: FloatArray) -> list[FloatArray]:
-        """As ``Simulator.simulate``, and tell that it was done."""
-        found = self._simulator.simulate(values)
-        self._advance(values.shape[1] * values.shape[2])
-        return found
-
     def _costs(self, points: FloatArray) -> FloatArray:
         """The sums of squares at some points, shape (k, n), with the measured initial states."""
         costs: list[FloatArray] = []
@@ -239,7 +231,7 @@ class Problem:
             refit: Whether to fit the initial states, if the problem fits them.
         """
         values = self._fit_states(parameters)[0] if refit else self._states
-        simulated = self._simulate(self._join(parameters, values))
+        simulated = self._simulator.simulate(self._join(parameters, values))
         if not all(np.isfinite(outputs).all() for outputs in simulated):
             raise SimulationError(f"the simulation failed: {self._simulator.failure}")
         names = self._simulator.outputs
@@ -351,7 +343,7 @@ class Problem:
     def _errors(self, values: FloatArray) -> list[FloatArray]:
         """Simulate, and return each trajectory's scaled residuals, shape (sets, n * outputs)."""
         found = []
-        parts = zip(self.trajectories, self._simulate(values), self._counted, strict=True)
+        parts = zip(self.trajectories, self._simulator.simulate(values), self._counted, strict=True)
         for one, simulated, counted in parts:
             measured = np.stack([one.outputs[n] for n in self._simulator.outputs], axis=1)
             scaled = ((simulated - measured) / self._scales)[:, counted]
@@ -404,6 +396,15 @@ def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
             f"with low <= start <= high, got {shown(limits)}"
         )
     return numbers[0], numbers[1], numbers[2]
+
+
+def _settable(experiment: Experiment, name: str) -> Variable:
+    variable = start_variable(experiment.fmu.description, name, 0.0)
+    if variable.kind != "real":
+        raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
+    if name in experiment.fixed:
+        raise ConfigError(f"{name!r} is both fixed and to be fitted")
+    return variable
 
 
 def _start_between(variable: Variable, low: float, high: float) -> float:

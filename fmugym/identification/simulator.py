@@ -71,7 +71,7 @@ class Simulator:
     Args:
         experiment: The settings. The simulator opens the FMU again with the same arguments.
         trajectories: Trajectories with the same outputs and inputs.
-        names: The variables whose values form a set: parameters, start values or inputs. The
+        free: The variables whose values form a set: parameters, start values or inputs. The
             value of an input is added to the logged input.
         num_sets: Largest number of sets.
 
@@ -85,7 +85,7 @@ class Simulator:
         self,
         experiment: Experiment,
         trajectories: Sequence[Trajectory],
-        names: Sequence[str],
+        free: Sequence[Variable],
         num_sets: int,
     ) -> None:
         step, fixed, plant = experiment.time_step, experiment.fixed, experiment.plant
@@ -96,7 +96,7 @@ class Simulator:
         self.outputs, logged = common_names(trajectories)
         step = step or median_interval(trajectories)
         self._grids = [_Grid(trajectory, step) for trajectory in trajectories]
-        self._free = [_settable(fmu, name, fixed) for name in names]
+        self._free, self._advance = free, experiment.advance
         self._start_rows = [k for k, v in enumerate(self._free) if v.causality != "input"]
         offsets = [v.name for v in self._free if v.causality == "input"]
         self._inputs = list(dict.fromkeys([*logged, *offsets]))
@@ -127,6 +127,7 @@ class Simulator:
         """
         names, num_sets, num_trajectories = values.shape
         record = self._run(values.reshape(names, num_sets * num_trajectories))
+        self._advance(num_sets * num_trajectories)
         record = record.reshape(*record.shape[:2], num_sets, num_trajectories)
         return [grid.sample(record[..., w]) for w, grid in enumerate(self._grids)]
 
@@ -249,15 +250,6 @@ def _as_in(given: PoolSpec, spec: PoolSpec) -> PoolSpec:
         warm_up_steps=0,
         records=False,
     )
-
-
-def _settable(fmu: FMU, name: str, fixed: Mapping[str, float | str]) -> Variable:
-    variable = start_variable(fmu.description, name, 0.0)
-    if variable.kind != "real":
-        raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
-    if name in fixed:
-        raise ConfigError(f"{name!r} is both fixed and to be fitted")
-    return variable
 
 
 def _constant(variable: Variable, value: float | str) -> float:
