@@ -17,6 +17,7 @@ from plant_tools import (
     changed,
     functions_in,
     house,
+    played,
     watched,
 )
 from process_tools import wait_until
@@ -201,8 +202,7 @@ class TestFaults:
         with Server(house(), "thermostat", clock=clock) as first:
             line = Line(first.address)
             env = connect(house(timeout="1s"), line.address, physical=True, clock=clock)
-            env.reset(seed=0)
-            env.step(np.float32([0.5]))
+            played(env, 1)
         clock.longest_wait = 0.1
         *_, info = env.step(np.float32([0.5]))
         assert "T, T_floor, power, u, clock: " in info["fault"]
@@ -240,8 +240,7 @@ class TestFaults:
         jump = [0.0]
         changed(monkeypatch, lambda values: {"clock": (values["clock"][0] + jump[0],)})
         env = shadowed(house())
-        env.reset(seed=0)
-        env.step(np.float32([0.5]))
+        played(env, 1)
         before, jump[0] = float(env.unwrapped.time), 4 * 3600.0
         *_, truncated, info = env.step(np.float32([0.5]))
         assert truncated
@@ -425,8 +424,7 @@ class TestData:
         task = self.task(prices)
         prices[1](5)
         env = shadowed(task)
-        env.reset(seed=0)
-        infos = [env.step(np.float32([0.3]))[-1] for _ in range(5)]
+        infos = played(env, 5)
         prices[1](24)
         *_, info = env.step(np.float32([0.3]))
         assert infos[0]["missing"] == ()
@@ -443,9 +441,7 @@ class TestPredictions:
         task = house(agent=seen, tags=tags)
         with Server(task, "thermostat", clock=clock) as server:
             env = connect(task, server.address, physical=True, ahead=3 * STEP, clock=clock)
-            env.reset(seed=0)
-            for _ in range(12):
-                *_, info = env.step(np.float32([0.3]))
+            info = played(env, 12)[-1]
             errors = {(one.name, one.ahead): one for one in env.errors()}
             env.close()
         assert set(info["predicted"]) == {"T", "T_floor", "T_mass", "power"}
@@ -462,9 +458,7 @@ class TestPredictions:
         for name, task in (("same", house()), ("another", leaky)):
             with Server(task, "thermostat", clock=clock) as server:
                 env = connect(house(), server.address, physical=True, ahead=4 * STEP, clock=clock)
-                env.reset(seed=0)
-                for _ in range(16):
-                    env.step(np.float32([0.3]))
+                played(env, 16)
                 found[name] = {(e.name, e.ahead): e for e in env.errors()}
                 env.close()
         same, another = (found[name]["T", 4 * STEP] for name in ("same", "another"))
@@ -535,9 +529,7 @@ class TestServer:
         task.document["variables"]["T"]["noise"] = 0.5
         shadow = shadowed(house(), task)
         env = RecordSeries(shadow)
-        env.reset(seed=0)
-        for _ in range(10):
-            env.step(np.float32([0.5]))
+        played(env, 10)
         assert np.diff(env.series["T"], 2).std() > 0.5
         assert np.diff(env.series["T_floor"], 2).std() < 5.0
 
