@@ -82,6 +82,13 @@ class TestShadow:
             found["power"][1:], plain["power"][first + 1 : first + 13], atol=0.61
         )
 
+    def test_an_action_is_the_median_of_its_readings(self, shadowed, monkeypatch):
+        """It is on for two thirds of each step, and off when a step ends."""
+        changed(monkeypatch, lambda values: {"u": (float(values["clock"][0] % STEP > 300.0),)})
+        env = RecordSeries(shadowed(house()))
+        played(env, 3)
+        assert env.series["u"][1:].tolist() == [1.0] * 3
+
     def test_its_record_is_a_log(self, server, clock, tmp_path):
         env = RecordSeries(watch(server, clock), path=tmp_path / "plant.csv")
         simulate(env, action_of(env.unwrapped, "0.5"), 0, 6)
