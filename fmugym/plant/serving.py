@@ -66,10 +66,8 @@ class _Twin:
         assert env.inside.quantities is not None
         assert env.inside.future is not None
         quantities, self._future = env.inside.quantities(), env.inside.future
-        self._read_all, self._quantities = (
-            quantities.read,
-            {one.name: one for one in quantities.all},
-        )
+        self._read_all = quantities.read
+        self._quantities = {one.name: one for one in quantities.all}
         self._sensors = self._places_of_sensors()
         self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
         policy.begin()
