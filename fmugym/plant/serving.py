@@ -136,19 +136,14 @@ class _Twin:
         if tag.name.startswith(DATA):
             ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
             return tuple(_at(self._data[tag.name.removeprefix(DATA)], time + ahead).tolist())
-        if tag.name not in self._quantities:
+        if tag.name == "clock":
             return (time,)
-        one, before, after = (
-            self._quantities[tag.name],
-            self._before[tag.name],
-            self._after[tag.name],
-        )
-        is_real = tag.variable is None or tag.variable.kind == "real"
+        before, after = self._before[tag.name], self._after[tag.name]
         if tag.sampling != "last":
-            part = 1.0  # it is that of the whole step
-        elif not is_real or one.holds or one.kind not in ("output", "data"):
-            part = 0.0
-        return (before + part * (after - before),)
+            return (after,)  # that of the whole step
+        one, is_real = self._quantities[tag.name], not tag.variable or tag.variable.kind == "real"
+        moves = is_real and not one.holds and one.kind in ("output", "data")
+        return (before + part * (after - before) if moves else before,)
 
 
 def _at(series: Series, times: Any) -> Any:
