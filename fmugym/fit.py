@@ -27,8 +27,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
-from fmugym.identification.problem import Experiment, silent
-from fmugym.identification.simulator import median_interval
+from fmugym.identification.simulator import Experiment, median_interval, silent
 from fmugym.logs import Columns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
 from fmugym.task.starting import start_variable

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any, Final
@@ -11,7 +11,7 @@ from fmugym.declared import TaskEnv
 from fmugym.declared.format import DEVICE
 from fmugym.env import FMUEnv
 
-__all__ = ["without_imperfections"]
+__all__ = ["ideal", "without_imperfections"]
 
 _OF_ACTUATORS: Final = ("delay", "bias", "noise", "drop_out")
 """An actuator has these itself. Its limits, steps and rates are the controller's to keep, too."""
@@ -31,7 +31,7 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
         The same environment if there is nothing to leave out; otherwise another one, which is
         closed in the end.
     """
-    document = _ideal(env.task.document) if isinstance(env, TaskEnv) else None
+    document = ideal(env.task.document) if isinstance(env, TaskEnv) else None
     if document is None or document == env.task.document:  # type: ignore[attr-defined]  # a TaskEnv
         yield env
         return
@@ -47,7 +47,15 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
         yield other
 
 
-def _ideal(document: Mapping[str, Any]) -> dict[str, Any]:
+def ideal(
+    document: Mapping[str, Any], of_actuators: Iterable[str] = _OF_ACTUATORS
+) -> dict[str, Any]:
+    """Return a task's document without its sensors, errors of forecasts and warm-up.
+
+    Args:
+        document: The document.
+        of_actuators: The keys of actuators that are left out, too.
+    """
     ideal = dict(document)
     ideal.pop("warm_up", None)
     agent = document.get("agent", {})
@@ -55,7 +63,7 @@ def _ideal(document: Mapping[str, Any]) -> dict[str, Any]:
     actions = [actions] if isinstance(actions, str) else actions
     variables = document.get("variables", {})
     ideal["variables"] = {
-        name: _without(one, _OF_ACTUATORS if name in actions else tuple(DEVICE))
+        name: _without(one, of_actuators if name in actions else DEVICE)
         for name, one in variables.items()
     }
     if "forecast" in agent:
@@ -71,7 +79,7 @@ def _exact(forecast: Any) -> Any:
     return [_without(one, ("error",)) for one in forecast]
 
 
-def _without(table: Any, keys: tuple[str, ...]) -> Any:
+def _without(table: Any, keys: Iterable[str]) -> Any:
     if not isinstance(table, Mapping):
         return table
     return {key: value for key, value in table.items() if key not in keys}

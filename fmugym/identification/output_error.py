@@ -30,7 +30,8 @@ from fmugym.distributions import Column
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
-from fmugym.identification.problem import Experiment, Limits, Problem
+from fmugym.identification.problem import Limits, Problem
+from fmugym.identification.simulator import Experiment
 from fmugym.identification.statistics import Correlation
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray
@@ -208,11 +209,10 @@ class FitResult:
             lead_in = check_number("lead_in", lead_in, positive=True, may_be_infinite=True)
         common_names(trajectories)
         experiment, shifted = self._for_prediction(trajectories)
-        if lead_in is None or not refit_initial_states:
-            return _simulate(experiment, shifted, refit_initial_states)
-        heads = [t.between(t.time[0], t.time[0] + lead_in) for t in shifted]
-        states = _simulate(experiment, heads, True).initial_values
-        return _simulate(experiment, shifted, False, states)
+        if lead_in is not None and refit_initial_states:
+            experiment = replace(experiment, lead_in=lead_in)
+        with closing(Problem(experiment, {}, shifted, refit_initial_states)) as problem:
+            return problem.compare(problem.start)
 
     def _for_prediction(
         self, trajectories: Sequence[Trajectory]
@@ -223,17 +223,6 @@ class FitResult:
         fixed = {n: v for n, v in self.values.items() if n not in offsets}
         experiment = replace(self.experiment, fixed={**self.experiment.fixed, **fixed})
         return experiment, [_shifted(t, {n: self.values[n] for n in offsets}) for t in trajectories]
-
-
-def _simulate(
-    experiment: Experiment,
-    trajectories: Sequence[Trajectory],
-    refit: bool,
-    states: Sequence[Mapping[str, float]] | None = None,
-) -> Comparison:
-    """Simulate with fixed parameters from refitted, measured or given initial states."""
-    with closing(Problem(experiment, {}, trajectories, refit)) as problem:
-        return problem.compare(problem.start, states)
 
 
 def fit_parameters(
@@ -328,7 +317,7 @@ def fit_of(
         solution, costs = problem.solve(max_evaluations, candidates)
         return FitResult(
             values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
-            **problem.uncertainty(solution)._asdict(),
+            **problem.uncertainty(solution),
             costs=tuple(costs),
             bounds=problem.bounds,
             comparison=problem.compare(solution.x),

@@ -10,18 +10,17 @@ number of trajectories.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
-from fmugym.identification.simulator import Simulator
+from fmugym.identification.simulator import Experiment, Simulator
 from fmugym.identification.statistics import (
     ROUNDING,
     Correlation,
@@ -29,11 +28,11 @@ from fmugym.identification.statistics import (
     newey_west,
     sandwich,
 )
-from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.task.pool_opening import PoolOpening
+from fmugym.task.starting import start_variable
 
-__all__ = ["Experiment", "Limits", "Problem", "Uncertainty", "silent"]
+__all__ = ["Limits", "Problem"]
 
 Limits = float | tuple[float, float] | tuple[float, float, float]
 
@@ -54,44 +53,6 @@ REWEIGHTINGS = 2
 
 LEAST_NOISE = 1e-6
 """Of an output, as a part of its standard deviation."""
-
-
-def silent(count: float) -> None:
-    """Tell nobody."""
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """The common settings of a fit and its predictions; see ``fit_parameters``.
-
-    ``plant`` is how a task opens the FMU; None if there is no task. ``advance`` is told how many
-    simulations were done since its last call.
-    """
-
-    fmu: FMU
-    initial_states: Mapping[str, str | float]
-    fixed: Mapping[str, float | str]
-    scales: Mapping[str, float] = field(default_factory=dict)
-    time_step: float | None = None
-    drop_repeats: bool = False
-    backend: str = "auto"
-    wash_in: float | None = None
-    plant: PoolOpening | None = None
-    advance: Callable[[float], None] = silent
-
-    def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
-        """Check the trajectories, and drop stale samples if requested."""
-        common_names(trajectories)
-        return tuple(t.without_repeats() if self.drop_repeats else t for t in trajectories)
-
-
-class Uncertainty(NamedTuple):
-    """How sure parameters are; see ``FitResult``."""
-
-    covariance: FloatArray
-    information: FloatArray
-    degrees_of_freedom: int
-    correlations: dict[str, Correlation]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,29 +118,17 @@ class Problem:
         self.trajectories = experiment.clean(trajectories)
         self._state_names = list(experiment.initial_states)
         self._states = _measured_states(experiment.initial_states, self.trajectories)
-        self._advance = experiment.advance
-        self._counted = [_counted(t, experiment.wash_in) for t in self.trajectories]
+        self._counted = [_counted(t, experiment) for t in self.trajectories]
         names = [*parameters, *self._state_names]
         self._rows = range(len(names) if fit_states else len(parameters))
-        self._simulator = Simulator(
-            experiment.fmu,
-            self.trajectories,
-            names,
-            experiment.fixed,
-            1 + len(self._rows),
-            experiment.time_step,
-            experiment.backend,
-            experiment.plant,
-        )
-        try:
-            self._set_limits([self._simulator.description.variable(n) for n in names], parameters)
-            outputs = self._simulator.outputs
-            self._scales = _scales(experiment.scales, self.trajectories, outputs)
-            self._given = [name in experiment.scales for name in outputs]
-        except BaseException:
-            self.close()
-            raise
+        variables = [_settable(experiment, name) for name in names]
+        self._set_limits(variables, parameters)
+        outputs = list(self.trajectories[0].outputs)
+        self._scales = _scales(experiment.scales, self.trajectories, outputs)
+        self._given = [name in experiment.scales for name in outputs]
         self._last = np.empty(0), self._states
+        count = 1 + len(self._rows)
+        self._simulator = Simulator(experiment, self.trajectories, variables, count)
 
     def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
         count = len(parameters)
@@ -252,12 +201,6 @@ class Problem:
         points[:, 0] = self.start
         return list(points[:, np.argsort(self._costs(points))[:DESCENTS]].T)
 
-    def _simulate(self, values: FloatArray) -> list[FloatArray]:
-        """As ``Simulator.simulate``, and tell that it was done."""
-        found = self._simulator.simulate(values)
-        self._advance(values.shape[1] * values.shape[2])
-        return found
-
     def _costs(self, points: FloatArray) -> FloatArray:
         """The sums of squares at some points, shape (k, n), with the measured initial states."""
         costs: list[FloatArray] = []
@@ -280,26 +223,15 @@ class Problem:
             max_nfev=max_evaluations,
         )
 
-    def compare(
-        self,
-        parameters: FloatArray,
-        states: Sequence[Mapping[str, float]] | None = None,
-        *,
-        refit: bool = True,
-    ) -> Comparison:
+    def compare(self, parameters: FloatArray, *, refit: bool = True) -> Comparison:
         """Simulate all trajectories.
 
         Args:
             parameters: Their values, shape (k,).
-            states: Given initial states of each trajectory, or None.
             refit: Whether to fit the initial states, if the problem fits them.
         """
-        values = self._states
-        if states is not None:
-            values = np.reshape([list(state.values()) for state in states], (len(states), -1)).T
-        elif refit:
-            values = self._fit_states(parameters)[0]
-        simulated = self._simulate(self._join(parameters, values))
+        values = self._fit_states(parameters)[0] if refit else self._states
+        simulated = self._simulator.simulate(self._join(parameters, values))
         if not all(np.isfinite(outputs).all() for outputs in simulated):
             raise SimulationError(f"the simulation failed: {self._simulator.failure}")
         names = self._simulator.outputs
@@ -309,8 +241,8 @@ class Problem:
             tuple(dict(zip(self._state_names, s, strict=True)) for s in values.T.tolist()),
         )
 
-    def uncertainty(self, solution: Any) -> Uncertainty:
-        """Say how sure the parameters are.
+    def uncertainty(self, solution: Any) -> dict[str, Any]:
+        """Say how sure the parameters are, by the attributes of ``FitResult``.
 
         Residuals that are no white noise count as correlated (Newey and West).
         """
@@ -322,7 +254,13 @@ class Problem:
         scores = weighed.T @ weighed
         if not all(one.is_noise for one in correlations.values()):
             scores, freedom = self._correlated(solution, correlations)
-        return Uncertainty(*sandwich(solution.jac, scores), freedom, correlations)
+        covariance, information = sandwich(solution.jac, scores)
+        return {
+            "covariance": covariance,
+            "information": information,
+            "degrees_of_freedom": freedom,
+            "correlations": correlations,
+        }
 
     def _correlations(self, solution: Any) -> dict[str, Correlation]:
         parts = self._by_trajectory(self._series(solution.fun))
@@ -405,7 +343,7 @@ class Problem:
     def _errors(self, values: FloatArray) -> list[FloatArray]:
         """Simulate, and return each trajectory's scaled residuals, shape (sets, n * outputs)."""
         found = []
-        parts = zip(self.trajectories, self._simulate(values), self._counted, strict=True)
+        parts = zip(self.trajectories, self._simulator.simulate(values), self._counted, strict=True)
         for one, simulated, counted in parts:
             measured = np.stack([one.outputs[n] for n in self._simulator.outputs], axis=1)
             scaled = ((simulated - measured) / self._scales)[:, counted]
@@ -460,17 +398,26 @@ def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
     return numbers[0], numbers[1], numbers[2]
 
 
+def _settable(experiment: Experiment, name: str) -> Variable:
+    variable = start_variable(experiment.fmu.description, name, 0.0)
+    if variable.kind != "real":
+        raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
+    if name in experiment.fixed:
+        raise ConfigError(f"{name!r} is both fixed and to be fitted")
+    return variable
+
+
 def _start_between(variable: Variable, low: float, high: float) -> float:
     if low <= variable.start_number <= high:
         return variable.start_number
     return (low + high) / 2
 
 
-def _counted(trajectory: Trajectory, wash_in: float | None) -> MaskArray:
-    """Which samples of a trajectory count: those after the wash-in."""
-    since = trajectory.time - trajectory.time[0]
+def _counted(trajectory: Trajectory, experiment: Experiment) -> MaskArray:
+    """Which samples of a trajectory count: those after the wash-in, and within the lead-in."""
+    since, wash_in = trajectory.time - trajectory.time[0], experiment.wash_in
     begin = -1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0)
-    counted = since > begin
+    counted = (since > begin) & (since < experiment.lead_in)
     if not counted.any():
         raise ConfigError(f"a log of {since[-1]:g} s has no samples after a wash-in of {begin:g} s")
     return np.asarray(counted)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from fmugym.task.pool_opening import PoolOpening
 from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
-__all__ = ["Simulator", "median_interval"]
+__all__ = ["Experiment", "Simulator", "median_interval", "silent"]
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +31,37 @@ MOST_STEPS = 10_000_000
 """A trajectory that needs more steps has a wrong time step."""
 
 
+def silent(count: float) -> None:
+    """Tell nobody."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The common settings of a fit and its predictions; see ``fit_parameters``.
+
+    ``lead_in`` is how many seconds of samples count. ``plant`` is how an environment opens the FMU,
+    if one does; its communication steps, samplings and start time hold then. ``advance`` is told
+    how many simulations were done since its last call.
+    """
+
+    fmu: FMU
+    initial_states: Mapping[str, str | float]
+    fixed: Mapping[str, float | str]
+    scales: Mapping[str, float] = field(default_factory=dict)
+    time_step: float | None = None
+    drop_repeats: bool = False
+    backend: str = "auto"
+    wash_in: float | None = None
+    lead_in: float = math.inf
+    plant: PoolOpening | None = None
+    advance: Callable[[float], None] = silent
+
+    def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
+        """Check the trajectories, and drop stale samples if requested."""
+        common_names(trajectories)
+        return tuple(t.without_repeats() if self.drop_repeats else t for t in trajectories)
+
+
 class Simulator:
     """One pool with an instance for each trajectory and each set of values.
 
@@ -37,19 +69,13 @@ class Simulator:
     Cubics interpolate the outputs at sampling instants between the steps.
 
     Args:
-        fmu: The FMU. The simulator opens it again with the same arguments.
+        experiment: The settings. The simulator opens the FMU again with the same arguments.
         trajectories: Trajectories with the same outputs and inputs.
-        names: The variables whose values form a set: parameters, start values or inputs. The
+        free: The variables whose values form a set: parameters, start values or inputs. The
             value of an input is added to the logged input.
-        fixed: Values of further parameters.
         num_sets: Largest number of sets.
-        time_step: In seconds; None for the trajectories' median sampling interval.
-        backend: See ``fmugym.pool.wishes.Wishes``.
-        plant: How an environment opens the FMU, if one does. Its communication steps, samplings
-            and start time hold then.
 
     Attributes:
-        description: The FMU's model description.
         num_sets: As given.
         outputs: The names of the outputs, in the order of the results.
         failure: The reason of the last failed simulation.
@@ -57,24 +83,20 @@ class Simulator:
 
     def __init__(
         self,
-        fmu: FMU,
+        experiment: Experiment,
         trajectories: Sequence[Trajectory],
-        names: Sequence[str],
-        fixed: Mapping[str, float | str],
+        free: Sequence[Variable],
         num_sets: int,
-        time_step: float | None = None,
-        backend: str = "auto",
-        plant: PoolOpening | None = None,
     ) -> None:
-        if time_step is not None:
-            time_step = check_number("time_step", time_step, positive=True)
-        fmu = FMU.of(fmu)
+        step, fixed, plant = experiment.time_step, experiment.fixed, experiment.plant
+        if step is not None:
+            step = check_number("time_step", step, positive=True)
+        fmu = FMU.of(experiment.fmu)
         self.failure, self.num_sets = "", num_sets
-        self.description = fmu.description
         self.outputs, logged = common_names(trajectories)
-        step = time_step or median_interval(trajectories)
+        step = step or median_interval(trajectories)
         self._grids = [_Grid(trajectory, step) for trajectory in trajectories]
-        self._free = [_settable(fmu, name, fixed) for name in names]
+        self._free, self._advance = free, experiment.advance
         self._start_rows = [k for k, v in enumerate(self._free) if v.causality != "input"]
         offsets = [v.name for v in self._free if v.causality == "input"]
         self._inputs = list(dict.fromkeys([*logged, *offsets]))
@@ -85,7 +107,7 @@ class Simulator:
         spec = PoolSpec(_inputs(fmu, self._inputs), _outputs(fmu, self.outputs), step)
         count = num_sets * len(trajectories)
         if plant is None:
-            self._pool = make_pool(fmu, spec, count, logger, backend=backend)
+            self._pool = make_pool(fmu, spec, count, logger, backend=experiment.backend)
         else:
             self._pool = replace(plant, fmu=fmu, spec=_as_in(plant.spec, spec)).open(count)
 
@@ -105,6 +127,7 @@ class Simulator:
         """
         names, num_sets, num_trajectories = values.shape
         record = self._run(values.reshape(names, num_sets * num_trajectories))
+        self._advance(num_sets * num_trajectories)
         record = record.reshape(*record.shape[:2], num_sets, num_trajectories)
         return [grid.sample(record[..., w]) for w, grid in enumerate(self._grids)]
 
@@ -200,12 +223,9 @@ class _Grid:
 def _lagrange_weights(x: FloatArray) -> FloatArray:
     """Return the weights of the values at 0, 1, 2, 3 in the cubic at x, shape (n, 4)."""
     points = np.arange(4.0)
-    weights = np.ones((len(x), 4))
-    for j in range(4):
-        for m in range(4):
-            if m != j:
-                weights[:, j] *= (x - points[m]) / (points[j] - points[m])
-    return weights
+    others = np.array([np.delete(points, place) for place in range(4)])
+    factors = (x[:, np.newaxis, np.newaxis] - others) / (points[:, np.newaxis] - others)
+    return np.asarray(factors.prod(axis=2))
 
 
 def median_interval(trajectories: Sequence[Trajectory]) -> float:
@@ -230,15 +250,6 @@ def _as_in(given: PoolSpec, spec: PoolSpec) -> PoolSpec:
         warm_up_steps=0,
         records=False,
     )
-
-
-def _settable(fmu: FMU, name: str, fixed: Mapping[str, float | str]) -> Variable:
-    variable = start_variable(fmu.description, name, 0.0)
-    if variable.kind != "real":
-        raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
-    if name in fixed:
-        raise ConfigError(f"{name!r} is both fixed and to be fitted")
-    return variable
 
 
 def _constant(variable: Variable, value: float | str) -> float:

@@ -14,7 +14,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
 
-__all__ = ["Trajectory", "common_names", "is_repeat"]
+__all__ = ["Trajectory", "common_names"]
 
 LONGEST_REPEAT = 5
 """Longer runs of equal samples are a plant at rest, not stale samples."""
@@ -109,24 +109,11 @@ class Trajectory:
 
         More than five repeats in a row stay, because they show a plant at rest.
         """
-        return self.select(~is_repeat(np.stack(list(self.outputs.values()))))
-
-
-def is_repeat(signals: FloatArray) -> MaskArray:
-    """Find the stale samples of signals that were logged together.
-
-    Args:
-        signals: Shape (k, n).
-
-    Returns:
-        Whether each sample repeats the one before in all k signals, shape (n,). Runs of more than
-        five repeats do not count.
-    """
-    same = np.concatenate([[False], (np.diff(signals, axis=1) == 0).all(axis=0)])
-    run = np.cumsum(~same) - 1
-    repeats = np.bincount(run) - 1
-    found: MaskArray = same & (repeats[run] <= LONGEST_REPEAT)
-    return found
+        signals = np.stack(list(self.outputs.values()))
+        same = np.concatenate([[False], (np.diff(signals, axis=1) == 0).all(axis=0)])
+        run = np.cumsum(~same) - 1
+        repeats = np.bincount(run) - 1
+        return self.select(~same | (repeats[run] > LONGEST_REPEAT))
 
 
 def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[str]]:

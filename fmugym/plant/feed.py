@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock, speed_of
 from fmugym.pool.base import FloatArray
 
-__all__ = ["Feed", "local_time", "told"]
+__all__ = ["Feed"]
 
 _LEAST_JUMP: Final = 60.0
 """Clocks that are apart by less, in seconds, have not jumped."""
@@ -27,78 +27,85 @@ _LATE: Final = 2.0
 """How late a thread or an answer may be, in seconds of real time."""
 
 
-def local_time() -> float:
+def _local_time() -> float:
     """The seconds since the beginning of the year, in the time of this place."""
     now = datetime.datetime.now()
     return (now - datetime.datetime(now.year, 1, 1)).total_seconds()
 
 
-def told(faults: Mapping[str, str]) -> str:
-    """What is wrong, in words; tags of which the same is wrong stand together."""
-    names: dict[str, list[str]] = {}
-    for name, why in faults.items():
-        names.setdefault(why, []).append(name)
-    return "; ".join(f"{', '.join(own)}: {why}" for why, own in names.items())
-
-
-@dataclass
 class Feed:
     """The values of a plant at its ticks, which lie on multiples of the time step.
 
-    It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing.
+    It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing, and the
+    start time of episodes.
 
     Args:
         clock: The monotonic clock of ticks and readings.
-        wall: Gives the plant's time in seconds of the year, unless there is a tag for it.
 
     Attributes:
         values: The present values of the tags, in the task's units.
         faults: What is wrong, by the names of tags whose last value goes on.
-        expired: The names of those whose last value has held for too long.
+        has_expired: Whether the last value of one has held for too long.
         time: The plant's time at the present tick.
         jump: By how much the plant's time has jumped, in seconds.
     """
 
-    clock: Clock
-    wall: Callable[[], float]
-    values: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    faults: dict[str, str] = field(default_factory=dict)
-    expired: tuple[str, ...] = ()
-    time: float = 0.0
-    jump: float = 0.0
     samples_outputs = True
 
-    def open(
-        self,
-        plant: Plant,
-        poller: Poller,
-        samplings: Mapping[str, str],
-        read: Callable[[], Mapping[str, float]],
-        live: Live,
-    ) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self._start = clock, _local_time() - clock.time()
+        self.values: dict[str, tuple[float, ...]] = {}
+        self.faults: dict[str, str] = {}
+        self.has_expired, self.time, self.jump = False, 0.0, 0.0
+
+    def open(self, plant: Plant, poller: Poller, live: Live) -> None:
         """Begin to read.
 
         Args:
             plant: Has the tags.
             poller: Reads them.
-            samplings: How tags are sampled within a step, where that is not ``"last"``.
-            read: Returns the outputs in the FMU's units by name, from ``values``.
             live: Gets the data of each tick.
         """
-        self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
-        self._live = live
+        self._plant, self._poller, self._live = plant, poller, live
         self._asked = dict.fromkeys(plant.tags, -np.inf)
         self._ahead, self._has_begun = 0.0, False
+
+    def row(self) -> dict[str, float]:
+        """What the FMU's variables have at this tick, in its units, by name."""
+        return {
+            tag.variable.name: tag.to_task.inverse(self.values[name][0])
+            for name, tag in self._plant.tags.items()
+            if tag.variable
+        }
+
+    def held(self) -> list[str]:
+        """The names of the FMU's variables whose last values go on."""
+        tags = [self._plant.tags.get(name) for name in self.faults]
+        return [tag.variable.name for tag in tags if tag and tag.variable]
+
+    def told(self) -> str:
+        """What is wrong, in words; tags of which the same is wrong stand together."""
+        names: dict[str, list[str]] = {}
+        for name, why in self.faults.items():
+            names.setdefault(why, []).append(name)
+        texts = [f"{', '.join(own)}: {why}" for why, own in names.items()]
+        if self.jump:
+            texts.append(f"the plant's clock has jumped by {self.jump:.6g} s")
+        return "; ".join(texts)
+
+    def sample(self, rng: np.random.Generator) -> float:
+        """Return when an episode begins: at the present tick."""
+        return self.time
 
     # The backend.
 
     def reset(self, start_values: Mapping[str, Any]) -> Mapping[str, float]:
         """Set nothing."""
-        return self._read()
+        return self.row()
 
     def step(self, inputs: Mapping[str, float]) -> tuple[Mapping[str, float], int]:
         """Write nothing."""
-        return self._read(), Status.OK
+        return self.row(), Status.OK
 
     def stop(self) -> None:
         """Do nothing: the plant goes on."""
@@ -118,7 +125,7 @@ class Feed:
         self.time, self.jump = now + (-now % step), 0.0
         self._live.begin()
         self._sleep()
-        if self.expired and not self._has_begun:
+        if self.has_expired and not self._has_begun:
             raise SimulationError(self._told())
         self._has_begun = True
 
@@ -140,7 +147,7 @@ class Feed:
                 raise SimulationError(self._told())
 
     def _told(self) -> str:
-        return f"the plant at {self._plant.address}: {told(self.faults)}"
+        return f"the plant at {self._plant.address}: {self.told()}"
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""
@@ -164,17 +171,19 @@ class Feed:
         self._look(tick - self._plant.step, tick)
         faults = self._live.refresh(self.time, self.values)
         self.faults |= faults
-        self.expired += tuple(faults)
+        self.has_expired |= bool(faults)
 
     def _seen_ahead(self) -> float:
         """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
-        if "clock" not in self._asked:
-            return self.wall() - self.clock.time()
-        return self.values["clock"][0] - self._asked["clock"]
+        if "clock" in self._asked:
+            return self.values["clock"][0] - self._asked["clock"]
+        if speed_of(self.clock) == 1.0:
+            return _local_time() - self.clock.time()
+        return self._start  # a clock that runs faster began with the time of this place
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
-        self.faults, expired = {}, []
+        self.faults, self.has_expired = {}, False
         rounds = self._poller.take(end)
         for name, asked in self._asked.items():
             good = [one for one in rounds if not one.answers[name].fault]
@@ -188,23 +197,21 @@ class Feed:
                 why = self._poller.trouble(name) or "no answer has come in time"
                 self.faults[name] = f"{why} (for {age:.6g} s)" if name in self.values else why
             if age > self._plant.stale_after + self._plant.hold:
-                expired.append(name)
-        self.expired = tuple(expired)
+                self.has_expired = True
 
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
         """What a step gives of its readings, a row for each."""
-        how = self._samplings.get(name, "last")
-        found = _SAMPLED[how](numbers)
+        how = self._plant.tags[name].sampling
+        found = numbers[-1] if how == "last" else _SAMPLED[how](numbers, axis=0)
         if how == "integral":
             found = found * self._plant.step
-        return tuple(np.ravel(found).tolist())
+        return tuple(found.tolist())
 
 
-_SAMPLED: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "last": lambda numbers: numbers[-1],
-    "mean": lambda numbers: numbers.mean(axis=0),
-    "integral": lambda numbers: numbers.mean(axis=0),
-    "min": lambda numbers: numbers.min(axis=0),
-    "max": lambda numbers: numbers.max(axis=0),
-    "median": lambda numbers: np.sort(numbers, axis=0)[len(numbers) // 2],
+_SAMPLED: Final[Mapping[str, Callable[..., Any]]] = {
+    "mean": np.mean,
+    "integral": np.mean,
+    "min": np.min,
+    "max": np.max,
+    "median": partial(np.quantile, q=0.5, method="higher"),  # one of the readings
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -24,18 +25,16 @@ class Live:
     """The data of environments, as they are known at a tick.
 
     Args:
-        env: Its agent sees the data.
+        envs: They read the data; the agent of the first one sees them.
         plant: Says where they come from.
-
-    Attributes:
-        envs: The environments that read them.
 
     Raises:
         ConfigError: If the agent sees data that have no live source, or not far enough ahead.
     """
 
-    def __init__(self, env: TaskEnv, plant: Plant) -> None:
-        root, self._plant = env.task.root, plant
+    def __init__(self, envs: Sequence[TaskEnv], plant: Plant) -> None:
+        self._envs = envs
+        root = envs[0].task.root
         self._entries = plant.entry.child("data").items()
         self._ahead = {name: horizon(root, name) for name in self._entries}
         for name in sorted(_seen(root)):
@@ -47,9 +46,8 @@ class Live:
             name: deque(maxlen=int(steps) + 3) for name in self._entries
         }
         self._require_tags()
-        self._units = env.fmu.description.units
+        self._units = envs[0].fmu.description.units
         self._own = {name: root.child("data").child(name).value.get("unit") for name in self._past}
-        self.envs: list[TaskEnv] = [env]
 
     def _require_tags(self) -> None:
         """Refuse tags that do not tell as much as the agent sees."""
@@ -117,7 +115,7 @@ class Live:
             past.append((float(times[0]), float(values[0])))
         before = np.array(past)[:-1].reshape(-1, 2).T
         times, values = np.append(before[0], times), np.append(before[1], values)
-        for env in self.envs:
+        for env in self._envs:
             lookup = None if env.inside.future is None else env.inside.future.lookups.get(name)
             if lookup is not None:
                 fits = times < times[0] + lookup.period

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
-from itertools import groupby, pairwise
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
@@ -25,8 +24,13 @@ _PORT: Final = 502
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
 
-_CODES: Final = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
-"""The functions that read, by what they read."""
+_KINDS: Final = {
+    "coil": (1, "read_coils"),
+    "discrete": (2, "read_discrete_inputs"),
+    "holding": (3, "read_holding_registers"),
+    "input": (4, "read_input_registers"),
+}
+"""The functions that read, by what they read: their codes, and the library's names."""
 
 _BITS: Final = ("coil", "discrete")
 
@@ -82,20 +86,13 @@ def _cells(place: _Place, values: Sequence[float]) -> Sequence[int]:
     numbers = [tag.conversion.inverse(value) for value in values]
     if place.is_bits:
         return [int(number > 0.5) for number in numbers]
-    if "int" in tag.address["type"]:
-        numbers = [_saturated(number, tag.address["type"]) for number in numbers]
+    if "int" in tag.address["type"]:  # as converters: the nearest one, and the lowest one for NaN
+        limits = np.iinfo(tag.address["type"])
+        numbers = [round(min(max(limits.min, number), limits.max)) for number in numbers]
     made: Sequence[int] = _registers().convert_to_registers(
         numbers, _type(tag), tag.address["word_order"]
     )
     return made
-
-
-def _saturated(number: float, kind: str) -> int:
-    """The nearest integer of a type, as converters give it; the lowest one for NaN."""
-    limits = np.iinfo(kind)
-    if math.isnan(number):
-        return int(limits.min)
-    return min(max(round(number), int(limits.min)), int(limits.max))
 
 
 def _places(plant: Plant) -> list[_Place]:
@@ -121,7 +118,6 @@ class ModbusClient:
 
     def __init__(self, plant: Plant) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
-        self._errors = imported("pymodbus.exceptions", "plant")
         self._codes = imported("pymodbus.constants", "plant").ExcCodes
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
@@ -144,44 +140,24 @@ class ModbusClient:
         """See ``polling.Client``."""
         found: dict[str, Answer] = {}
         for block in self._blocks:
-            found |= await self._read(block)
-        return found
-
-    async def _read(self, block: Sequence[_Place]) -> dict[str, Answer]:
-        begin, whole = block[0].begin, block[0]._replace(end=block[-1].end)
-        cells, fault = await self._ask(whole)
-        if not fault:
-            return {
-                one.tag.name: _answer(one, cells[one.begin - begin : one.end - begin])
-                for one in block
-            }
-        if len(block) == 1:
-            return {block[0].tag.name: Answer((), fault)}
-        found: dict[str, Answer] = {}
-        for one in block:  # one of them may be the reason
-            found |= await self._read([one])
+            begin = block[0].begin
+            whole, fault = await self._ask(block[0]._replace(end=block[-1].end))
+            for one in block:
+                cells, why = whole[one.begin - begin : one.end - begin], fault
+                if fault and len(block) > 1:  # another one may be the reason
+                    cells, why = await self._ask(one)
+                found[one.tag.name] = Answer((), why) if why else _answer(one, cells)
         return found
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
         """The registers or bits, and what the server says instead."""
-        client = self._client
-        ask = {
-            "holding": client.read_holding_registers,
-            "input": client.read_input_registers,
-            "coil": client.read_coils,
-            "discrete": client.read_discrete_inputs,
-        }[place.kind]
-        if not client.connected:
+        ask = getattr(self._client, _KINDS[place.kind][1])
+        if not self._client.connected:
             raise LostError("the connection is lost")
         cells: list[Any] = []
         for begin in range(place.begin, place.end, _MOST):
             count = min(_MOST, place.end - begin)
-            try:
-                told = await ask(begin, count=count, device_id=place.unit_id)
-            except self._errors.ConnectionException:
-                raise LostError("the connection is lost") from None
-            except self._errors.ModbusException:
-                raise LostError("it does not answer, or not by Modbus") from None
+            told = await ask(begin, count=count, device_id=place.unit_id)
             if told.isError():
                 known, code = {one.value: one.name for one in self._codes}, told.exception_code
                 where = f"{place.kind} {begin} of unit {place.unit_id}"
@@ -221,9 +197,8 @@ async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator
         if one[:2] == after[:2] and after.begin < one.end:
             text = f"it shares {one.kind} {after.begin} with {one.tag.name!r}"
             raise after.tag.entry.error(text)
-    units = groupby(places, key=lambda one: one.unit_id)
-    devices = [_device(unit_id, [*own], values) for unit_id, own in units]
-    server = server_of(devices, address=("127.0.0.1", port))
+    server = server_of([], address=("127.0.0.1", port))
+    server.context = _Registers(places, values)
     await server.serve_forever(background=True)
     try:
         yield f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}"
@@ -231,41 +206,27 @@ async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator
         await server.shutdown()
 
 
-def _device(unit_id: int, places: Sequence[_Place], values: Values) -> Any:
-    """A device whose registers are written anew before each reading."""
-    simulator = imported("pymodbus.simulator", "plant")
-    refused = imported("pymodbus.constants", "plant").ExcCodes.ILLEGAL_FUNCTION
+class _Registers:
+    """Where a server finds registers and bits: it makes them of the values of now."""
 
-    async def look(
-        code: int, start: int, address: int, count: int, registers: list[int], written: Any
-    ) -> Any:
-        if written is not None:
-            return refused
-        now = values()
-        for one in places:
-            if _CODES[one.kind] == code:
-                _put(registers, start, one, _cells(one, now[one.tag.name]))
-        return None
+    def __init__(self, places: Sequence[_Place], values: Values) -> None:
+        self._places, self._values = places, values
+        self._codes = imported("pymodbus.constants", "plant").ExcCodes
 
-    areas = tuple([_area(simulator, kind, places)] for kind in _CODES)
-    return simulator.SimDevice(unit_id, areas, action=look)
+    # The library gives these methods their names.
 
+    async def async_getValues(self, unit_id: int, code: int, begin: int, count: int) -> Any:  # noqa: N802
+        """The cells from some place on; those between tags are 0."""
+        found: dict[int, int] = {}
+        now = self._values()
+        for one in self._places:
+            if (one.unit_id, _KINDS[one.kind][0]) == (unit_id, code):
+                cells = _cells(one, now[one.tag.name])
+                found |= zip(range(one.begin, one.end), cells, strict=True)
+        if not (found and min(found) <= begin and begin + count <= max(found) + 1):
+            return self._codes.ILLEGAL_ADDRESS
+        return [found.get(place, 0) for place in range(begin, begin + count)]
 
-def _put(registers: list[int], start: int, place: _Place, cells: Sequence[int]) -> None:
-    if not place.is_bits:
-        registers[place.begin - start : place.end - start] = cells
-        return
-    for at, bit in enumerate(cells, place.begin - 16 * start):
-        word, mask = at // 16, 1 << (at % 16)
-        registers[word] = registers[word] | mask if bit else registers[word] & ~mask
-
-
-def _area(simulator: Any, kind: str, places: Sequence[_Place]) -> Any:
-    """What the library needs to know of the registers of a kind, or of the bits."""
-    own = [one for one in places if one.kind == kind]
-    begin, end = min((one.begin for one in own), default=0), max([1, *(one.end for one in own)])
-    if kind in _BITS:
-        bits = [False] * (-(-end // 16) * 16)
-        return simulator.SimData(0, values=bits, datatype=simulator.DataType.BITS)
-    form = simulator.DataType.REGISTERS
-    return simulator.SimData(begin, count=end - begin, datatype=form)
+    async def async_setValues(self, *_: Any) -> Any:  # noqa: N802
+        """Refuse who writes."""
+        return self._codes.ILLEGAL_FUNCTION

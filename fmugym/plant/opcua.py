@@ -9,21 +9,18 @@ from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.plant.modbus import Values
-from fmugym.plant.polling import Answer, LostError, RefusedError
+from fmugym.plant.polling import Answer, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
 from fmugym.signals import Ignoring
 
 __all__ = ["OpcUaClient", "serve_opcua"]
-
-_REFUSALS: Final = ("Certificate", "Security", "Identity", "UserAccess")
-"""Words in the names of status codes of a server that refuses a client."""
 
 logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
@@ -51,30 +48,21 @@ class OpcUaClient:
             self._client.set_user(self._user[0])
             self._client.set_password(self._user[1])
         try:
-            await self._connect()
+            if self._keys is not None:
+                await self._secure(*self._keys)
+            await self._client.connect()
             yield
         finally:
             with Ignoring(Exception):  # there may be nobody to say goodbye to
                 await self._client.disconnect()
 
-    async def _connect(self) -> None:
-        try:
-            if self._keys is not None:
-                await self._secure(*self._keys)
-            await self._client.connect()
-        except self._ua.UaError as error:
-            raise self._lost(error) from None
-
-    def _lost(self, error: Exception) -> LostError:
-        name = type(error).__name__
-        if any(word in name for word in _REFUSALS):
-            return RefusedError(f"it refuses this client: {name}")
-        return LostError(f"it does not answer: {name} {error}".strip())
-
     async def _secure(self, certificate: Path, key: Path) -> None:
         policies = imported("asyncua.crypto.security_policies", "plant")
-        own = await _certificate_in(certificate)
-        self._client.application_uri = _uri_in(own) or self._client.application_uri
+        x509, own = imported("cryptography.x509", "plant"), await _certificate_in(certificate)
+        for one in own.extensions:
+            if isinstance(one.value, x509.SubjectAlternativeName):  # the application it is for
+                for uri in one.value.get_values_for_type(x509.UniformResourceIdentifier)[:1]:
+                    self._client.application_uri = uri
         pinned = self._plant["server_certificate"]
         if pinned is not None:
             text = f"its certificate is not that of {shown(pinned)}"
@@ -85,10 +73,7 @@ class OpcUaClient:
     async def read(self) -> dict[str, Answer]:
         """See ``polling.Client``."""
         attribute = self._ua.AttributeIds.Value
-        try:
-            told = await self._client.uaclient.read_attributes(self._nodes, attribute)
-        except self._ua.UaError as error:
-            raise self._lost(error) from None
+        told = await self._client.uaclient.read_attributes(self._nodes, attribute)
         pairs = zip(self._tags, told, strict=True)
         return {tag.name: self._answer(tag, one) for tag, one in pairs}
 
@@ -153,17 +138,6 @@ def _content(path: Path) -> Any:
 async def _certificate_in(path: Path) -> Any:
     load, found = imported("asyncua.crypto.uacrypto", "plant").load_certificate, _content(path)
     return await load(found.path_or_content, found.extension)
-
-
-def _uri_in(certificate: Any) -> str:
-    """The application that a certificate is for."""
-    x509 = imported("cryptography.x509", "plant")
-    names = [
-        one.value.get_values_for_type(x509.UniformResourceIdentifier)
-        for one in certificate.extensions
-        if isinstance(one.value, x509.SubjectAlternativeName)
-    ]
-    return str(names[0][0]) if names and names[0] else ""
 
 
 # The server.

@@ -21,6 +21,10 @@ _MOST: Final = 10_000
 """So many rounds are kept until they are used."""
 
 
+_REFUSALS: Final = ("Certificate", "Security", "Identity", "UserAccess")
+"""Words in the names of errors of a server that refuses a client."""
+
+
 class LostError(FMUGymError):
     """The server is not there, or does not answer."""
 
@@ -62,14 +66,14 @@ class Client(Protocol):
         """Connect, and disconnect in the end, whatever has happened before.
 
         Raises:
-            LostError: If it cannot connect.
+            Exception: If it cannot connect.
         """
 
     async def read(self) -> dict[str, Answer]:
         """Read all tags.
 
         Raises:
-            LostError: If the server does not answer.
+            Exception: If the server does not answer.
         """
 
 
@@ -104,10 +108,16 @@ class Poller:
                 except ordinary(TimeoutError):
                     self._trouble = f"it does not answer within {self._timeout:g} s"
                 except ordinary(Exception) as error:  # whatever a library makes of a broken line
-                    is_own = isinstance(error, LostError)
-                    self._trouble = str(error) if is_own else f"{type(error).__name__}: {error}"
-                    self.is_refused = isinstance(error, RefusedError)
+                    self._note(error)
             await asyncio.sleep(self._interval / self._speed)
+
+    def _note(self, error: Exception) -> None:
+        name = type(error).__name__
+        refuses = any(word in name for word in _REFUSALS)
+        what = "it refuses this client" if refuses else "it does not answer"
+        is_own = isinstance(error, LostError)
+        self._trouble = str(error) if is_own else f"{what}: {name} {error}".strip()
+        self.is_refused = refuses or isinstance(error, RefusedError)
 
     async def _converse(self, connection: AsyncExitStack) -> None:
         async with asyncio.timeout(self._timeout):

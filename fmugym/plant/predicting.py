@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from fmugym.archive.units import Conversion
 from fmugym.baselines.observer import COPIES, Observer, spread
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant, tagged
+from fmugym.plant.tags import Plant
 from fmugym.plant.written import Written
 from fmugym.pool.base import FloatArray
 
@@ -56,39 +56,26 @@ class Predictions:
     def __init__(
         self, make_env: Callable[[], TaskEnv], feed: Feed, plant: Plant, steps: int
     ) -> None:
-        self._feed, self._plant, self._steps = feed, plant, steps
-        self.envs: list[TaskEnv] = []
-        self._written: list[Written] = []
-        self._spread: dict[str, FloatArray] = {}
-        self._tags: list[tuple[int, str, Conversion]] = []
-        if steps:
-            self._make(make_env)
-        self.names = [alias for _, alias, _ in self._tags]
-        shape = (steps, len(self.names))
-        self._sums, self._squares = np.zeros(shape), np.zeros(shape)
-        self._counts = np.zeros(shape, np.int64)
+        self._feed, self._plant = feed, plant
+        self.envs = [make_env()] if steps else []
+        self._spread = spread(self.envs[0], 0) if steps else {}
+        self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
+        self._written = [Written(env, feed, plant) for env in self.envs]
+        self._tags = plant.of(self.envs[0].inside.spec.outputs) if steps else []
+        self.names = [tag.name for tag in self._tags]
+        # of the errors, by horizon and variable: how many, their sum, and that of their squares
+        self._sums = np.zeros((3, steps, len(self.names)))
         self._told: deque[tuple[int, FloatArray]] = deque(maxlen=max(steps, 1))
-
-    def _make(self, make_env: Callable[[], TaskEnv]) -> None:
-        self.envs.append(make_env())
-        self._spread = spread(self.envs[0], 0)
-        for _ in range(COPIES - 1 if self._spread else 0):
-            self.envs.append(make_env())
-        self._written = [Written(env, self._feed, self._plant) for env in self.envs]
-        self._tags = tagged(self.envs[0], self._plant, self.envs[0].inside.spec.outputs)
 
     def _measured(self) -> FloatArray:
         return np.array([self._feed.values[name][0] for name in self.names])
 
     def _seen(self) -> FloatArray:
         """What the copies give, shape (n, k)."""
-        outputs = self.envs[0].inside.spec.outputs
-        return np.array(
-            [[c(env.out[outputs[k].name]) for k, _, c in self._tags] for env in self.envs]
-        )
+        return np.array([[tag.of_fmu(env.out) for tag in self._tags] for env in self.envs])
 
-    def begin(self) -> None:
-        """Begin with the offsets that the plant has now."""
+    def begin(self) -> dict[str, float]:
+        """Begin with the offsets that the plant has now; nothing was foretold for it."""
         for place, env in enumerate(self.envs):
             own = {name: float(values[place]) for name, values in self._spread.items()}
             env.reset(seed=0, options={"model_parameters": own})
@@ -97,6 +84,7 @@ class Predictions:
         if self.envs:
             self._observer.offsets = self._measured() - self._seen()
             self._tell()
+        return dict.fromkeys(self.names, np.nan)
 
     def _tell(self) -> None:
         """Keep which copy predicts from now on, and its offsets."""
@@ -113,17 +101,14 @@ class Predictions:
             return {}
         pairs = zip(self.envs, self._written, strict=True)
         if any(self._has_failed(env, written) for env, written in pairs):
-            self.begin()
-            return dict.fromkeys(self.names, np.nan)
+            return self.begin()
         is_new = np.array([name not in self._feed.faults for name in self.names])
         measured, seen = self._measured(), self._seen()
         found = [seen[best] + offsets for best, offsets in reversed(self._told)]
         for place, values in enumerate(found):
-            off = np.where(is_new, measured - values, 0.0)
-            self._sums[place] += off
-            self._squares[place] += off**2
-            self._counts[place] += is_new
-        self._observer.follow(np.where(is_new, measured - seen, 0.0))
+            off = measured - values
+            self._sums[:, place] += is_new * [np.ones_like(off), off, off**2]
+        self._observer.follow(is_new * (measured - seen))
         self._observer.correct(measured - seen, is_new)
         self._tell()
         return dict(zip(self.names, found[0].tolist(), strict=True))
@@ -137,10 +122,8 @@ class Predictions:
     def errors(self) -> list[Error]:
         """The errors until now, by variable and horizon."""
         found = []
-        for place, ahead in np.argwhere(self._counts.T).tolist():
-            count = int(self._counts[ahead, place])
-            rms = float(np.sqrt(self._squares[ahead, place] / count))
-            bias = float(self._sums[ahead, place] / count)
-            seconds = (ahead + 1) * self._plant.step
-            found.append(Error(self.names[place], seconds, rms, bias, count))
+        for place, ahead in np.argwhere(self._sums[0].T).tolist():
+            count, total, squares = self._sums[:, ahead, place].tolist()
+            seconds, rms = (ahead + 1) * self._plant.step, math.sqrt(squares / count)
+            found.append(Error(self.names[place], seconds, rms, total / count, int(count)))
         return found

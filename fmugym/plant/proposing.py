@@ -6,7 +6,6 @@ from contextlib import closing
 from dataclasses import replace
 from typing import Any, Final
 
-from fmugym.checks import check_option
 from fmugym.declared import Task, TaskEnv
 from fmugym.errors import ConfigError
 from fmugym.plant.live import forecasts, horizon
@@ -34,7 +33,6 @@ def with_plant(task: Task, protocol: str) -> Task:
     Raises:
         ConfigError: If the plant of the task has another protocol, or the task has a mistake.
     """
-    check_option("protocol", protocol, _SECTIONS)
     own = task.document.get("plant", {}).get("protocol", protocol)
     if own != protocol:
         raise ConfigError(f"[plant] of the task has the protocol {own!r}, not {protocol!r}")

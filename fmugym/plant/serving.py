@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import threading
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import replace
@@ -21,7 +20,7 @@ from fmugym.errors import ConfigError, FMUGymError, SimulationError
 from fmugym.plant.background import Background
 from fmugym.plant.modbus import serve_modbus
 from fmugym.plant.opcua import serve_opcua
-from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
+from fmugym.plant.tags import DATA, Plant, Tag, read_plant
 from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 
 __all__ = ["Server", "endless", "environment"]
@@ -66,8 +65,9 @@ class _Twin:
         self._seed, self._most = seed, most
         assert env.inside.quantities is not None
         assert env.inside.future is not None
-        self._quantities, self._future = env.inside.quantities(), env.inside.future
-        self._is_late, self._is_straight = self._shapes()
+        quantities, self._future = env.inside.quantities(), env.inside.future
+        self._read_all = quantities.read
+        self._quantities = {one.name: one for one in quantities.all}
         self._sensors = self._places_of_sensors()
         self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
         policy.begin()
@@ -77,35 +77,23 @@ class _Twin:
         self._after = self._read()
         self._advance()
 
-    def _shapes(self) -> tuple[Any, Any]:
-        """Which quantities are those of the step, and which move on straight lines."""
-        variables, late, straight = in_fmu(self._env), [], []
-        for one in self._quantities.all:
-            variable, _ = variables.get(one.name, (None, None))
-            is_sampled = variable is not None and variable.sampling != "last"
-            late.append(one.kind in ("action", "input") or is_sampled)
-            is_real = variable is None or variable.kind == "real"
-            straight.append(one.kind in ("output", "data") and is_real and not one.holds)
-        return np.array(late), np.array(straight)
-
-    def _places_of_sensors(self) -> dict[int, int]:
-        """What sensors show in the observation, by the places of the quantities."""
+    def _places_of_sensors(self) -> dict[str, int]:
+        """Where in the observation is what sensors show, by name."""
         names = self._env.observation_names or ()
         if "normalize" in self._env.unphysical_keys:
             return {}
         declared = self._env.task.document.get("variables", {})
         return {
-            place: names.index(one.name)
-            for place, one in enumerate(self._quantities.all)
-            if one.kind == "output" and one.name in names
-            if DEVICE.keys() & declared.get(one.name, {}).keys()
+            name: names.index(name)
+            for name, one in self._quantities.items()
+            if one.kind == "output" and name in names
+            if DEVICE.keys() & declared.get(name, {}).keys()
         }
 
-    def _read(self) -> Any:
-        found = np.array(self._quantities.read(self._env), np.float64)
-        for place, seen in self._sensors.items():
-            found[place] = self._observation[seen]
-        return found
+    def _read(self) -> dict[str, float]:
+        read = dict(zip(self._quantities, self._read_all(self._env), strict=True))
+        seen = {name: self._observation[place] for name, place in self._sensors.items()}
+        return {name: float(value) for name, value in (read | seen).items()}
 
     def _advance(self) -> None:
         self._before = self._after
@@ -140,20 +128,22 @@ class _Twin:
         while self._steps <= passed and self._steps < self._most:
             self._advance()
         part = passed - (self._steps - 1)
-        moved = self._before + part * (self._after - self._before)
-        now = np.where(self._is_straight, moved, self._before)
-        now = np.where(self._is_late, self._after, now)
-        found = dict(zip([one.name for one in self._quantities.all], now.tolist(), strict=True))
         time = float(self._future.clock(self._env)) + (part - 1.0) * self._plant.step
-        found["clock"] = time
-        return {name: self._of_tag(name, found, time) for name in self._plant.tags}
+        return {name: self._of_tag(tag, part, time) for name, tag in self._plant.tags.items()}
 
-    def _of_tag(self, name: str, found: Mapping[str, float], time: float) -> tuple[float, ...]:
-        if not name.startswith(DATA):
-            return (found[name],)
-        tag = self._plant.tags[name]
-        ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
-        return tuple(_at(self._data[name.removeprefix(DATA)], time + ahead).tolist())
+    def _of_tag(self, tag: Tag, part: float, time: float) -> tuple[float, ...]:
+        """What a tag has when some part of a step has passed."""
+        if tag.name.startswith(DATA):
+            ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
+            return tuple(_at(self._data[tag.name.removeprefix(DATA)], time + ahead).tolist())
+        if tag.name == "clock":
+            return (time,)
+        before, after = self._before[tag.name], self._after[tag.name]
+        if tag.sampling != "last":
+            return (after,)  # that of the whole step
+        one, is_real = self._quantities[tag.name], not tag.variable or tag.variable.kind == "real"
+        moves = is_real and not one.holds and one.kind in ("output", "data")
+        return (before + part * (after - before) if moves else before,)
 
 
 def _at(series: Series, times: Any) -> Any:
@@ -203,11 +193,11 @@ class Server:
         self._task, self._port = endless(Task.of(config)), port
         self._player = _player_of(player) if isinstance(player, str) else player
         self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
-        self.address, self._is_bound = "", threading.Event()
+        self.address = ""
         self.summary: Callable[[], Summary]
         self._background = Background(self._serve, "plant server")
-        while not self._is_bound.wait(0.01) and not self._background.is_over:
-            pass
+        while not (self.address or self._background.is_over):
+            self._background.join(0.01)
         self._raise()
 
     async def _serve(self) -> None:
@@ -219,7 +209,6 @@ class Server:
             self.summary = twin.summary
             serve = _SERVERS[plant["protocol"]]
             async with serve(plant, self._port, twin.values) as self.address:
-                self._is_bound.set()
                 pause = plant.step / 2 / speed_of(self._clock)
                 is_over = False
                 while not is_over:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
@@ -15,51 +15,28 @@ import numpy as np
 from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
+from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
-from fmugym.plant.feed import Feed, local_time, told
+from fmugym.plant.feed import Feed
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
 from fmugym.plant.polling import Poller
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
-from fmugym.plant.tags import DATA, Plant, read_plant, tagged
-from fmugym.plant.written import Written, lacking_tag
-from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
-from fmugym.task.warm_up import WarmUp, WarmUps
+from fmugym.plant.tags import DATA, read_plant
+from fmugym.plant.written import Written
+from fmugym.pool.backend.clocks import Clock, RealClock
 
 __all__ = ["Shadow", "connect"]
 
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
 
-class _PresentTime:
-    """The start time of an episode: that of the plant."""
-
-    def __init__(self, feed: Feed) -> None:
-        self._feed = feed
-
-    def sample(self, rng: np.random.Generator) -> float:
-        """Return the time of the present tick, in seconds of the year."""
-        return self._feed.time
-
-
 def _watched(task: Task, feed: Feed) -> Task:
     """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
-    task = on_time_of_year(endless(task), _PresentTime(feed))
-    document = dict(task.document)
-    variables = document.get("variables", {})
-    document["variables"] = {
-        alias: {key: value for key, value in given.items() if key not in DEVICE}
-        for alias, given in variables.items()
-    }
-    agent = dict(document.get("agent", {}))
-    if "forecast" in agent:
-        given = agent["forecast"]
-        agent["forecast"] = [
-            {k: v for k, v in one.items() if k != "error"} for one in _listed(given)
-        ]
-    return replace(task, document={**document, "agent": agent})
+    task = on_time_of_year(endless(task), feed)
+    return replace(task, document=ideal(task.document, DEVICE))
 
 
 def _with_past(task: Task) -> Task:
@@ -67,35 +44,11 @@ def _with_past(task: Task) -> Task:
     agent = task.document.get("agent", {})
     if "history" not in agent:
         return task
-    held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
+    actions = agent["actions"]
+    actions = [actions] if isinstance(actions, str) else actions
+    held = dict.fromkeys(actions, 0.0)  # what acts in the plant is known then
     warm_up = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**task.document, "warm_up": warm_up})
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else [value]
-
-
-class _Watching(WarmUp):
-    """Fills histories: the steps before the first observation, with what acts in the plant."""
-
-    def __init__(self, declared: WarmUp, feed: Feed, written: Written) -> None:
-        self.steps, self.writes = declared.steps, declared.writes
-        self._declared, self._feed, self._written = declared, feed, written
-
-    def begin(self, count: int) -> None:
-        """See ``WarmUp.begin``."""
-        self._declared.begin(count)
-
-    def inputs(self, env: Any) -> Any:
-        """See ``WarmUp.inputs``: wait, and see what has acted."""
-        values = self._declared.inputs(env)
-        self._feed.advance()
-        return self._written.over(np.array([np.ravel(value)[0] for value in values]))
-
-    def update(self, env: Any) -> None:
-        """See ``WarmUp.update``."""
-        self._declared.update(env)
 
 
 class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -138,14 +91,12 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         self._feed.begin()
         observation, info = self.env.reset(seed=seed, options=options)
-        self._copies.begin()
         self._proposed = dict.fromkeys(self._written.names, math.nan)
-        predicted = dict.fromkeys(self._copies.names, math.nan)
-        return observation, info | self._told(predicted)
+        return observation, info | self._told(self._copies.begin())
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Wait for the next tick; see the class."""
-        if not self._feed.expired:
+        if not self._feed.has_expired:
             self._proposed = self._written.proposed(action)
         self._feed.advance()
         observation, reward, terminated, truncated, info = self.env.step(self._written.action())
@@ -154,13 +105,10 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _told(self, predicted: dict[str, float]) -> dict[str, Any]:
-        feed = self._feed
-        faults = [told(feed.faults)] if feed.faults else []
-        if feed.jump:
-            faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
-        info: dict[str, Any] = {"proposed": self._proposed, "predicted": predicted}
-        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.faults)
-        return info | ({"fault": "; ".join(faults)} if faults else {})
+        missing = tuple(name.removeprefix(DATA) for name in self._feed.faults)
+        info = {"proposed": self._proposed, "predicted": predicted, "missing": missing}
+        fault = self._feed.told()
+        return info | ({"fault": fault} if fault else {})
 
     def close(self) -> None:
         """End the connection."""
@@ -194,15 +142,17 @@ def connect(
             ``plant`` is missing.
     """
     task, clock = Task.of(config), clock or RealClock()
-    feed = Feed(clock, _wall(clock))
+    feed = Feed(clock)
     watched = _watched(task, feed)
     own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
         env = stack.enter_context(closing(environment(own, backend=feed)))
         plant = read_plant(env, address)
         written = Written(env, feed, plant)
-        read, env.inside.held, samplings = _reading(env, feed, plant)
-        _watch_warm_up(env, feed, written)
+        for output in env.inside.spec.outputs:
+            plant.require(output)
+        env.inside.held = feed.held
+        _fill_histories(env, feed, written)
         model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(
@@ -211,45 +161,24 @@ def connect(
             plant,
             int(ahead / plant.step + 1e-9),
         )
-        live = Live(env, plant)
-        live.envs += copies.envs
+        live = Live([env, *copies.envs], plant)
         client = _CLIENTS[plant["protocol"]](plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
-        samplings |= dict.fromkeys(written.names, "median")
-        feed.open(plant, poller, samplings, read, live)
+        feed.open(plant, poller, live)
         return Shadow(env, feed, written, copies, stack.pop_all())
 
 
-def _wall(clock: Clock) -> Callable[[], float]:
-    """The time of this place; if a clock runs faster, it began with that."""
-    if speed_of(clock) == 1.0:
-        return local_time
-    start = local_time() - clock.time()
-    return lambda: start + clock.time()
+def _fill_histories(env: TaskEnv, feed: Feed, written: Written) -> None:
+    """Let steps before the first observation wait, and see what has acted."""
+    if env.inside.warm_ups is None:
+        return
+    warm_up = env.inside.warm_ups.warm_up
+    declared = warm_up.inputs
 
+    def inputs(env: Any) -> Any:
+        values = declared(env)
+        feed.advance()
+        return written.over(np.array([np.ravel(value)[0] for value in values]))
 
-def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
-    if env.inside.warm_ups is not None:
-        watching = _Watching(env.inside.warm_ups.warm_up, feed, written)
-        env.inside.warm_ups = WarmUps(env, watching)
-
-
-def _reading(
-    env: TaskEnv, feed: Feed, plant: Plant
-) -> tuple[Callable[[], Mapping[str, float]], Callable[[], list[str]], dict[str, str]]:
-    """What reads all that the task reads, in the FMU's units; what of it holds; its samplings."""
-    outputs = env.inside.spec.outputs
-    found = tagged(env, plant, outputs)
-    known = {place for place, *_ in found}
-    for place, one in enumerate(outputs):
-        if place not in known:
-            raise lacking_tag(one.name)
-
-    def read() -> dict[str, float]:
-        return {outputs[k].name: own.inverse(feed.values[alias][0]) for k, alias, own in found}
-
-    def held() -> list[str]:
-        return [outputs[k].name for k, alias, _ in found if alias in feed.faults]
-
-    return read, held, {alias: outputs[k].sampling for k, alias, _ in found}
+    warm_up.inputs = inputs  # type: ignore[method-assign]  # of this one environment

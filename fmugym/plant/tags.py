@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
-from fmugym.archive.units import Conversion, conversion_between
+from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
 from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.logs import declared_as
 
-__all__ = ["DATA", "Plant", "Tag", "in_fmu", "read_plant", "tagged"]
+__all__ = ["DATA", "Plant", "Tag", "read_plant"]
 
 DATA = "data."
 """What the names of tags of live data begin with."""
@@ -31,6 +31,9 @@ class Tag:
         conversion: From the plant's number to the unit of the task.
         count: How many numbers there are.
         low, high: The limits of the task, infinite where there are none.
+        variable: That of the FMU which the task writes or reads; None for time and data.
+        to_task: From the FMU's unit to that of the task.
+        sampling: What of its readings within a step counts.
     """
 
     name: str
@@ -40,6 +43,14 @@ class Tag:
     count: int = 1
     low: float = -math.inf
     high: float = math.inf
+    variable: Variable | None = None
+    to_task: Conversion = IDENTITY
+    sampling: str = "last"
+
+    def of_fmu(self, values: Mapping[str, Any]) -> Any:
+        """Its value in the unit of the task, of the FMU's values by name."""
+        assert self.variable is not None
+        return self.to_task(values[self.variable.name])
 
     def misfit(self, number: float) -> str:
         """What is strange about a number, which a wrong type would make; "" if nothing is."""
@@ -76,33 +87,16 @@ class Plant:
         """The value of a key; None if it is not given."""
         return self.entry.value.get(key)
 
+    def of(self, variables: Iterable[Variable]) -> list[Tag]:
+        """The tags of some of the FMU's variables."""
+        names = {one.name for one in variables}
+        return [tag for tag in self.tags.values() if tag.variable and tag.variable.name in names]
 
-def in_fmu(env: TaskEnv) -> dict[str, tuple[Variable, Conversion]]:
-    """The variables that an environment writes and reads, by their names in the task.
-
-    Each comes with the conversion from the FMU's unit to that of the task.
-    """
-    spec, units = env.inside.spec, env.fmu.description.units
-    known = {variable.name: variable for variable in (*spec.inputs, *spec.outputs)}
-    found = {}
-    for alias in dict.fromkeys([*env.task.document.get("variables", {}), *known]):
-        name, unit = declared_as(env, alias)
-        variable = known.get(name)
-        if variable is not None:
-            found[alias] = variable, conversion_between(variable.unit, unit, units)
-    return found
-
-
-def tagged(
-    env: TaskEnv, plant: Plant, variables: Sequence[Variable]
-) -> list[tuple[int, str, Conversion]]:
-    """Those of some variables that have a tag: place, name in the task, and conversion to it."""
-    places = {variable.name: place for place, variable in enumerate(variables)}
-    return [
-        (places[variable.name], alias, conversion)
-        for alias, (variable, conversion) in in_fmu(env).items()
-        if variable.name in places and alias in plant.tags
-    ]
+    def require(self, variable: Variable, name: str = "") -> None:
+        """Refuse a plant without a tag for a variable that the task needs, by its name there."""
+        if not self.of([variable]):
+            text = f"[plant] has no tag for {name or variable.name!r}, which the task needs"
+            raise ConfigError(text)
 
 
 def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
@@ -132,8 +126,8 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
     others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
     for name, one in entry.child("tags").items().items():
         if name in known:
-            limits = {"low": known[name].low, "high": known[name].high}
-            yield replace(_tag(env, name, one, known[name].unit), **limits)
+            low, high = known[name].low, known[name].high
+            yield _tag(env, name, one, known[name].unit, low=low, high=high, **_in_fmu(env, name))
         elif name not in others:  # the task does not read the others
             raise one.error(unknown_name("variable of the task", name, [*known, *others]))
     if entry.child("clock").value is not None:
@@ -145,13 +139,25 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
             yield _tag(env, DATA + name, one, data[name].get("unit", ""))
 
 
-def _tag(env: TaskEnv, name: str, entry: Entry, unit: str) -> Tag:
+def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
+    """What a tag says of the variable of the FMU, if the task writes or reads one by this name."""
+    own, unit = declared_as(env, name)
+    spec = env.inside.spec
+    for one in (*spec.outputs, *spec.inputs):
+        if one.name == own:
+            to_task = conversion_between(one.unit, unit, env.fmu.description.units)
+            sampling = "median" if one in spec.inputs else one.sampling
+            return {"variable": one, "to_task": to_task, "sampling": sampling}
+    return {}
+
+
+def _tag(env: TaskEnv, name: str, entry: Entry, unit: str, **others: Any) -> Tag:
     given = entry.value
     _require_protocol(entry, env.task.root.child("plant").child("protocol").value)
     with entry.placing():
         own = conversion_between(given.get("unit"), unit or None, env.fmu.description.units)
     raw = Conversion(given["scale"], given["offset"])
-    return Tag(name, entry, given, own.after(raw), given.get("count", 1))
+    return Tag(name, entry, given, own.after(raw), given.get("count", 1), **others)
 
 
 def _require_protocol(entry: Entry, protocol: str) -> None:

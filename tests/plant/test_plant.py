@@ -17,6 +17,7 @@ from plant_tools import (
     changed,
     functions_in,
     house,
+    played,
     watched,
 )
 from process_tools import wait_until
@@ -80,6 +81,13 @@ class TestShadow:
         np.testing.assert_allclose(
             found["power"][1:], plain["power"][first + 1 : first + 13], atol=0.61
         )
+
+    def test_an_action_is_the_median_of_its_readings(self, shadowed, monkeypatch):
+        """It is on for two thirds of each step, and off when a step ends."""
+        changed(monkeypatch, lambda values: {"u": (float(values["clock"][0] % STEP > 300.0),)})
+        env = RecordSeries(shadowed(house()))
+        played(env, 3)
+        assert env.series["u"][1:].tolist() == [1.0] * 3
 
     def test_its_record_is_a_log(self, server, clock, tmp_path):
         env = RecordSeries(watch(server, clock), path=tmp_path / "plant.csv")
@@ -201,8 +209,7 @@ class TestFaults:
         with Server(house(), "thermostat", clock=clock) as first:
             line = Line(first.address)
             env = connect(house(timeout="1s"), line.address, physical=True, clock=clock)
-            env.reset(seed=0)
-            env.step(np.float32([0.5]))
+            played(env, 1)
         clock.longest_wait = 0.1
         *_, info = env.step(np.float32([0.5]))
         assert "T, T_floor, power, u, clock: " in info["fault"]
@@ -224,11 +231,12 @@ class TestFaults:
             env.reset()
 
     def test_a_tag_that_does_not_exist(self, shadowed):
-        task = house(tags=tags_with(T_floor={"register": 900, "type": "int16"}))
-        env, said = shadowed(task, house()), r"T_floor: holding 900 of unit 1: .*ILLEGAL_ADDRESS"
+        """It is asked for together with the clock, which has the registers before."""
+        task = house(tags=tags_with(T_floor={"register": 104, "type": "int16"}))
+        env, said = shadowed(task, house()), r"T_floor: holding 104 of unit 1: .*ILLEGAL_ADDRESS"
         with pytest.raises(ConfigError, match=said) as told:
             env.reset()
-        assert "power: " not in str(told.value)
+        assert "clock" not in str(told.value)
 
     def test_a_wrong_type(self, shadowed):
         wrong = {"register": 0, "type": "float64", "unit": "K", "word_order": "little"}
@@ -240,8 +248,7 @@ class TestFaults:
         jump = [0.0]
         changed(monkeypatch, lambda values: {"clock": (values["clock"][0] + jump[0],)})
         env = shadowed(house())
-        env.reset(seed=0)
-        env.step(np.float32([0.5]))
+        played(env, 1)
         before, jump[0] = float(env.unwrapped.time), 4 * 3600.0
         *_, truncated, info = env.step(np.float32([0.5]))
         assert truncated
@@ -425,8 +432,7 @@ class TestData:
         task = self.task(prices)
         prices[1](5)
         env = shadowed(task)
-        env.reset(seed=0)
-        infos = [env.step(np.float32([0.3]))[-1] for _ in range(5)]
+        infos = played(env, 5)
         prices[1](24)
         *_, info = env.step(np.float32([0.3]))
         assert infos[0]["missing"] == ()
@@ -443,9 +449,7 @@ class TestPredictions:
         task = house(agent=seen, tags=tags)
         with Server(task, "thermostat", clock=clock) as server:
             env = connect(task, server.address, physical=True, ahead=3 * STEP, clock=clock)
-            env.reset(seed=0)
-            for _ in range(12):
-                *_, info = env.step(np.float32([0.3]))
+            info = played(env, 12)[-1]
             errors = {(one.name, one.ahead): one for one in env.errors()}
             env.close()
         assert set(info["predicted"]) == {"T", "T_floor", "T_mass", "power"}
@@ -462,9 +466,7 @@ class TestPredictions:
         for name, task in (("same", house()), ("another", leaky)):
             with Server(task, "thermostat", clock=clock) as server:
                 env = connect(house(), server.address, physical=True, ahead=4 * STEP, clock=clock)
-                env.reset(seed=0)
-                for _ in range(16):
-                    env.step(np.float32([0.3]))
+                played(env, 16)
                 found[name] = {(e.name, e.ahead): e for e in env.errors()}
                 env.close()
         same, another = (found[name]["T", 4 * STEP] for name in ("same", "another"))
@@ -535,9 +537,7 @@ class TestServer:
         task.document["variables"]["T"]["noise"] = 0.5
         shadow = shadowed(house(), task)
         env = RecordSeries(shadow)
-        env.reset(seed=0)
-        for _ in range(10):
-            env.step(np.float32([0.5]))
+        played(env, 10)
         assert np.diff(env.series["T"], 2).std() > 0.5
         assert np.diff(env.series["T_floor"], 2).std() < 5.0
 

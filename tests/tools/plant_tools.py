@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 import fmugym
 from fmugym.declared import Task
 from fmugym.lab import ManualClock
@@ -166,6 +168,12 @@ def watched(clock, address, task):
         yield env
     finally:
         env.close()
+
+
+def played(env, steps, action=0.5):
+    """Begin an episode, and return what some steps tell."""
+    env.reset(seed=0)
+    return [env.step(np.float32([action]))[-1] for _ in range(steps)]
 
 
 def changed(monkeypatch, change):
