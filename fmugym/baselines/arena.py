@@ -59,6 +59,12 @@ class Outcome(NamedTuple):
         excess = np.nan_to_num(beyond.sum(axis=1) + 0 * returns, nan=np.inf)
         return list(zip((-excess).tolist(), returns.tolist(), strict=True))
 
+    @property
+    def order(self) -> list[int]:
+        """The candidates by their merits, the best one first."""
+        merits = self.merits
+        return sorted(range(len(merits)), key=merits.__getitem__, reverse=True)
+
 
 @dataclass
 class Arena:

@@ -68,13 +68,12 @@ class Entrant:
         """
         found = self.cma.ask()
         outcome = arena.play(self.make, found, seeds)
-        merits = outcome.merits
-        order = sorted(range(len(found)), key=merits.__getitem__, reverse=True)
-        self.cma.tell(np.array(order))
+        self.cma.tell(np.array(outcome.order))
         self.rounds += 1
-        reached = merits[order[0]]
+        best = outcome.order[0]
+        reached = outcome.merits[best]
         if not reached <= self.lead:  # NaN included
-            self.leader, self.lead = found[order[0]], reached
+            self.leader, self.lead = found[best], reached
         self._note_agreement(outcome.returns)
         return reached
 

@@ -238,8 +238,7 @@ class Search:
         rows = agent.extended(sizes * self._rng.standard_normal((_MANY, width)))
         outcome = arena.play(agent, rows, self._training(self.episodes), has_moments=True)
         self.rounds += 1
-        order = sorted(range(_MANY), key=outcome.merits.__getitem__)
-        best = outcome.moments[order[-(_MANY // _BEST_PART) :]]
+        best = outcome.moments[outcome.order[: _MANY // _BEST_PART]]
         return scale_of(best.sum(axis=(0, 1)))
 
     # Who wins.
