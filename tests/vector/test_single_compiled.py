@@ -152,23 +152,6 @@ class Telling(Counting):
         return {"count": self.variables["count"], "action": self.action, "time": self.time}
 
 
-def require_same_snapshots(one, other):
-    """Go back to a snapshot in two environments; the first one runs compiled."""
-    rng, results = np.random.default_rng(0), []
-    size = one.action_space.shape
-    actions = [rng.uniform(-0.01, 0.01, size).astype(np.float32) for _ in range(6)]
-    for env in (one, other):
-        env.reset(seed=6)
-        found = [env.step(action) for action in actions[:2]]
-        snapshot = env.save_state()
-        found += [env.step(action) for action in actions[2:4]]
-        env.restore_state(snapshot)
-        found += [env.step(action) for action in actions[2:]]
-        results.append(found)
-    assert all(map(same, *results))
-    require_readings(one, other)
-
-
 TASKS = [Tracking, Delayed, Goal, Tables, Acting, Counting, Telling]
 
 
