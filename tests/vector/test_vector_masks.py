@@ -213,18 +213,6 @@ def test_masks_of_every_form(form, made):
     require_same(quick, second.reset(options={"reset_mask": mask.tolist()}))
 
 
-def test_parameters_given_before_count(made):
-    """Options give some episodes other constants: the general way."""
-    first, second = made(CART_POLE), made(CART_POLE)
-    mask = np.array([True, True, False, False, False])
-    for envs in first, second:
-        envs.reset(options={"reset_mask": mask, "model_parameters": {"x_0": 0.5}})
-    assert play_both(first, second, 20) >= 5
-    first.set_attr("m_cart", [1.0, 2.0, 3.0, 4.0, 5.0])
-    second.set_attr("m_cart", [1.0, 2.0, 3.0, 4.0, 5.0])
-    assert play_both(first, second, 20) >= 5
-
-
 def test_options_that_give_no_parameter(make_envs):
     """The FMU gets no start value at all."""
     envs = make_envs(lambda: Drawing(model_parameters={}), 2)
