@@ -105,6 +105,12 @@ def make_envs(opened):
 
 
 @pytest.fixture
+def vector_of(make_envs):
+    """Make some whose episodes do not start by themselves."""
+    return lambda make, n=3, **options: make_envs(make, n, autoreset_mode="Disabled", **options)
+
+
+@pytest.fixture
 def make_env(probe, opened):
     """Make environments over the probe that are closed after the test."""
 
@@ -141,6 +147,18 @@ def temp_root(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(root))
     monkeypatch.setenv("TMPDIR", str(root))  # for child processes
     return root
+
+
+@pytest.fixture
+def trials(monkeypatch):
+    """Trials as users have them; their cache serves all tests of a run."""
+    monkeypatch.delenv("FMUGYM_PROBE")
+
+
+@pytest.fixture
+def own_trials(trials, monkeypatch, tmp_path):
+    """The same with a cache for each test."""
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import gymnasium
 import numpy as np
 import pytest
-from test_snapshots import vector_of
 
 import fmugym
 from fmugym.linearization import derivatives
@@ -75,7 +74,7 @@ def fixture_snapshot():
 
 
 @pytest.mark.parametrize("num_envs", [1, 10, 64])
-def test_are_those_of_the_equations(snapshot, num_envs):
+def test_are_those_of_the_equations(snapshot, num_envs, vector_of):
     torques = np.random.default_rng(0).uniform(-0.015, 0.015, HORIZON)
     envs = vector_of(Precise, num_envs)
     found = derivatives(envs, snapshot, torques[:, None])
@@ -85,22 +84,19 @@ def test_are_those_of_the_equations(snapshot, num_envs):
     assert found.by_actions[..., 0] == pytest.approx(by_actions, rel=1e-5, abs=1e-5)
     assert found.of_rewards[..., 0] == pytest.approx(of_rewards, rel=1e-4, abs=1e-4)
     assert found.of_return[:, 0] == pytest.approx(of_rewards.sum(axis=0), rel=1e-4, abs=1e-4)
-    envs.close()
 
 
-def test_of_actions_at_their_bounds(snapshot):
+def test_of_actions_at_their_bounds(snapshot, vector_of):
     envs = vector_of(Precise, 8)
     torques = np.full(HORIZON, 0.02)
     found = derivatives(envs, snapshot, torques[:, None], step=1e-4)
     _, by_actions, _ = by_hand(torques)
     assert found.by_actions[..., 0] == pytest.approx(by_actions, rel=1e-2, abs=1e-3)
-    envs.close()
 
 
-def test_later_actions_have_no_influence(snapshot):
+def test_later_actions_have_no_influence(snapshot, vector_of):
     envs = vector_of(Precise, 8)
     found = derivatives(envs, snapshot, np.zeros((HORIZON, 1)))
     later = np.triu(np.ones((HORIZON, HORIZON), bool), 1)
     assert not found.by_actions[:, :, :, 0].transpose(0, 2, 1)[later].any()
     assert not found.of_rewards[later].any()
-    envs.close()

@@ -1,5 +1,7 @@
 """Linear models along a trajectory, compared with equations, scipy and each other."""
 
+from functools import partial
+
 import exchange_tools
 import gymnasium
 import numpy as np
@@ -8,11 +10,10 @@ from combinations import in_turn
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from test_derivatives import DT, HORIZON, B, G, L, M, Precise
-from test_snapshots import vector_of
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
-from fmugym import ConfigError, SimulationError
+from fmugym import ConfigError, FMUVectorEnv, SimulationError
 from fmugym.envs import CartPoleEnv
 from fmugym.linearization import derivatives, linearize, linearize_along
 from fmugym.linearization.trajectories import discrete
@@ -21,6 +22,7 @@ from fmugym.pool.native import NativePool
 TORQUES = np.random.default_rng(0).uniform(-0.015, 0.015, (HORIZON, 1)).astype(np.float32)
 STARTS = {"q": "q_0", "q_dot": "q_dot_0"}
 EXACT = {"solver": 3, "max_step": 1e-3}
+vector_of = partial(FMUVectorEnv, autoreset_mode="Disabled")
 
 
 def along(make_env=Precise, actions=TORQUES, num_envs=8, options=None, **arguments):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from plants import ONCE
 
-import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.archive.bundled import BUNDLED
 from fmugym.fmi import Status
@@ -371,33 +370,6 @@ class TestIsolation:
         assert pool.reset(variables, np.array([[4.0, 0.0], [1.0, 1.0]]))[0].tolist() == [[1, 1]]
         assert pool.step()[1].tolist() == [Status.FATAL, Status.OK]
         assert pool.reset((), np.zeros((0, 2)))[0].tolist() == [[1, 1]]
-
-    def test_probe_finds_shared_globals(self, shared, busy, temp_root):
-        assert disturb(FMU(shared))
-        assert not disturb(FMU(busy))
-        assert list(temp_root.iterdir()) == []
-
-    def test_vector_environments_give_private_libraries_by_themselves(
-        self, shared, caplog, make_envs
-    ):
-        class Counting(fmugym.FMUEnv):
-            def __init__(self):
-                config = {"model_input_names": "work", "model_output_names": "total"}
-                bounds = {"work": (0.0, 10.0)}
-                super().__init__(shared, config | {"time_step": 0.1, "bounds": bounds})
-
-            def _is_done(self):
-                return False
-
-        envs = make_envs(Counting, 3, hooks="per_env")  # a probe would count too
-        assert "disturb each other" in caplog.text
-        single = Counting()
-        single.reset()
-        envs.reset()
-        for work in (0.0, 1.0, 2.0):
-            alone = single.step(work)[0].tolist()
-            assert envs.step(np.full((3, 1), work, np.float32))[0].tolist() == [alone] * 3
-        single.close()
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):

@@ -13,21 +13,16 @@ from combinations import in_turn
 from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 from test_snapshot_machine import Machine
-from test_snapshots import ACTIONS, POOLS, Track, play, play_vector, vector_of
+from test_snapshots import ACTIONS, POOLS, Track, play, play_vector
 from zoo_tools import resident_bytes
 
 import fmugym
 from fmugym import SimulationError
 from fmugym.pool.bundle import SaveMethod
 
+pytestmark = pytest.mark.usefixtures("trials")  # which find out that copies work
+
 VERSIONS = ("2.0", "3.0")
-
-
-@pytest.fixture(autouse=True)
-def _tried(tmp_path_factory, monkeypatch):
-    """Trials of FMUs find out that copies work; their cache serves all tests."""
-    monkeypatch.delenv("FMUGYM_PROBE")
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "copies-cache"))
 
 
 @pytest.fixture(scope="module", name="paths")
@@ -106,21 +101,7 @@ def test_other_environments_play_it_again(copying, pool):
             assert play(other) == expected
 
 
-def test_after_a_restore_the_log_is_whole(copying):
-    """So that a second snapshot fits other environments, too."""
-    with copying() as env, copying() as other:
-        snapshot = begin(env).save_state()
-        env.reset(seed=1)
-        env.restore_state(snapshot)
-        for action in ACTIONS[:4]:
-            env.step(action)
-        second = pickle.loads(pickle.dumps(env.save_state()))
-        expected = play(env)
-        other.restore_state(second)
-        assert play(other) == expected
-
-
-def test_in_a_vector_environment(copying):
+def test_in_a_vector_environment(copying, vector_of):
     envs = vector_of(copying, 4)
     begin(envs, 0)
     for action in ACTIONS[:6]:
@@ -137,10 +118,9 @@ def test_in_a_vector_environment(copying):
     first = play_vector(envs, 0)
     envs.restore_state(snapshot[2], [1, 3])
     assert play_vector(envs, 1) == first
-    envs.close()
 
 
-def test_candidates_and_deep_copies(copying):
+def test_candidates_and_deep_copies(copying, vector_of):
     with copying() as env:
         snapshot = begin(env).save_state()
         envs = vector_of(copying, 8)
@@ -153,7 +133,6 @@ def test_candidates_and_deep_copies(copying):
             assert reward == found.rewards[3, step]
             assert twin.step(action)[1] == reward
         twin.close()
-        envs.close()
 
 
 def test_after_a_fault_it_is_played_again(copying, caplog):
@@ -167,15 +146,6 @@ def test_after_a_fault_it_is_played_again(copying, caplog):
             assert not env.step(ACTIONS[0])[3]
         env.restore_state(snapshot)
         assert play(env) == expected
-
-
-def test_of_an_episode_that_has_ended(copying):
-    with copying(max_episode_steps=3) as env:
-        begin(env, 3)
-        env.restore_state(env.save_state())
-        with pytest.raises(SimulationError, match="reset"):
-            env.step(ACTIONS[0])
-        env.reset(seed=0)
 
 
 @pytest.mark.parametrize("hooks", ["compiled", "per_env"])

@@ -59,10 +59,8 @@ class LicenceServer:
 
 
 @pytest.fixture
-def licences(tmp_path, monkeypatch):
-    """Trials as users have them, with a cache for each test, and a licence server."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
+def licences(own_trials, tmp_path, monkeypatch):
+    """A licence server, beside trials as users have them."""
     return LicenceServer(tmp_path / "seats", monkeypatch)
 
 

@@ -14,6 +14,8 @@ from combinations import in_turn
 import fmugym
 from fmugym.archive.bundled import FMI_VERSIONS, bundled_fmu
 
+pytestmark = pytest.mark.usefixtures("trials")
+
 MADE = makers.MADE | {
     f"bundled {version}": makers.Made(
         lambda folder, version=version: bundled_fmu("Pendulum", version),
@@ -57,13 +59,6 @@ def make_fmu(tmp_path_factory):
     return functools.cache(lambda name: MADE[name].build(tmp_path_factory.mktemp("made")))
 
 
-@pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path_factory):
-    """Trials as users have them; the cache serves all tests of a session."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path_factory.getbasetemp() / "made verdicts"))
-
-
 def actions_of(name, length, index=0):
     """Moving inputs of one environment, shape (steps, inputs)."""
     swing = np.sin(0.9 * np.arange(length) + index)
@@ -85,10 +80,7 @@ def test_single(make_fmu, name, isolation):
     env.reset(seed=7)
     for length in LENGTHS:
         _, info = env.reset()
-        rows = [list(env.state)]
-        for action in actions_of(name, length):
-            env.step(action)
-            rows.append(list(env.state))
+        rows = fresh.episode(env, actions_of(name, length))
         assert rows == expected(path, name, info.get("drawn", {}), length)
     env.close()
 
@@ -100,12 +92,8 @@ def test_vector(make_fmu, name, way, make_envs):
     envs.reset(seed=7)
     for length in LENGTHS:
         _, infos = envs.reset()
-        rows = [np.array(envs.get_attr("state"))]
         actions = [actions_of(name, length, index) for index in range(NUM_ENVS)]
-        for action in np.stack(actions, axis=1):
-            envs.step(action)
-            rows.append(np.array(envs.get_attr("state")))
-        for index, states in enumerate(np.swapaxes(rows, 0, 1).tolist()):
+        for index, states in enumerate(fresh.episodes(envs, np.stack(actions, axis=1))):
             told = infos.get("drawn", {}).items()
             drawn = {n: values[index] for n, values in told if not n.startswith("_")}
             assert states == expected(path, name, drawn, length, index)

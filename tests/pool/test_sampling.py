@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from fmu_tools import PlainEnv
 from pool_tools import KINDS, open_pool, start, step
 
-import fmugym
 from fmugym import FMU, ConfigError, bundled_fmu
 from fmugym.pool.spec import SAMPLINGS
 
@@ -60,39 +60,10 @@ def test_an_integral_over_one_substep(make):
     np.testing.assert_array_equal(results[:, 0], values[:, 0])
 
 
-class Cart(fmugym.FMUEnv):
-    def __init__(self, backend=None, **changes):
-        config = {
-            "model_input_names": "f",
-            "model_output_names": ["x", "x_dot"],
-            "monitor_names": "theta",
-            "time_step": STEP,
-            "substeps": SUBSTEPS,
-            "samplings": {"x_dot": "mean", "theta": "max"},
-        }
-        super().__init__(bundled_fmu("CartPole"), config | changes, backend=backend)
-
-    def _is_done(self):
-        return self.out["theta"] > 3.0
-
-    def _reward_policy(self):
-        return -abs(self.out["x_dot"])
-
-
-def test_one_environment_equals_those_of_a_vector(make_envs):
-    env, envs = Cart(), make_envs(Cart, 2, hooks="compiled")
-    np.testing.assert_array_equal(env.reset(seed=1)[0], envs.reset(seed=1)[0][0])
-    for action in np.linspace(-1, 1, 6, dtype=np.float32):
-        single = env.step([action])
-        results = envs.step(np.full((2, 1), action))
-        for one, many in zip(single[:4], results[:4], strict=True):
-            np.testing.assert_array_equal(one, many[0])
-    env.close()
-
-
 @pytest.mark.parametrize(
     ("samplings", "fact"), [({"x": "avg"}, "'avg'"), ({"y": "mean"}, "'y'"), (["x"], "dict")]
 )
 def test_mistakes_are_named(samplings, fact):
+    config = {"model_input_names": "f", "model_output_names": "x", "samplings": samplings}
     with pytest.raises(ConfigError, match=fact):
-        Cart(samplings=samplings)
+        PlainEnv(bundled_fmu("CartPole"), config)

@@ -114,24 +114,6 @@ class TestEnvironments:
         with pytest.raises(fmugym.FMULoadError, match=r"tests.*none\.ssp"):
             TwoHouses("none.ssp")
 
-    def test_houses_that_are_not_connected_are_as_if_alone(self):
-        """One FMU alone, stepped by the same pool, is the reference."""
-
-        class Alone(PlainEnv):
-            def __init__(self, path, prefixes=("",)):
-                names = [[f"{p}{n}" for p in prefixes] for n in ("u", "T_air")]
-                config = {"model_input_names": names[0], "model_output_names": names[1]}
-                super().__init__(path, config | {"time_step": 900.0})
-
-        both = Alone(FMUSystem({"a": HOUSE, "b": HOUSE}), ("a.", "b."))
-        one, other = Alone(HOUSE), Alone(HOUSE)
-        assert both.reset()[0].tolist() == [*one.reset()[0], *other.reset()[0]]
-        for step in range(20):
-            actions = np.array([step % 2, (step % 3) / 2], np.float32)
-            seen = both.step(actions)[0]
-            alone = [env.step(actions[[i]])[0][0] for i, env in enumerate((one, other))]
-            assert seen.tolist() == alone
-
     def test_units_of_the_system_hold_in_the_environment(self):
         env = TwoHouses(two_houses())
         (_, outside) = env.action_space.low
@@ -148,19 +130,6 @@ class TestEnvironments:
 
     def test_the_checks_of_any_environment(self):
         check_fmu_env(TwoHouses(two_houses()))
-
-    def test_rollouts_from_a_snapshot_are_what_steps_give(self, make_envs):
-        env, planner = TwoHouses(two_houses()), make_envs(lambda: TwoHouses(two_houses()), 3)
-        planner.reset(seed=1)
-        env.reset(seed=0)
-        env.step(np.array([1.0, 0.0]))
-        snapshot = env.save_state()
-        actions = np.random.default_rng(0).uniform([0, -5], [1, 10], (3, 5, 2)).astype(np.float32)
-        found = planner.rollout(snapshot, actions)
-        for candidate in range(3):
-            env.restore_state(snapshot)
-            seen = [env.step(action)[0] for action in actions[candidate]]
-            assert np.array_equal(found.observations[candidate], seen)
 
     def test_parameters_of_a_component_are_identified(self):
         """The data are of a house of 140 m2; the default is 150."""

@@ -3,7 +3,6 @@
 What a system computes does not depend on where it runs.
 """
 
-import contextlib
 import pickle
 from dataclasses import replace
 
@@ -31,7 +30,6 @@ from system_tools import (
 
 import fmugym
 from fmugym import Component, ConfigError, Connection, FMULoadError, FMUSystem, bundled_fmu
-from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.native import NativePool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import ResetMethod
@@ -207,18 +205,6 @@ class TestResults:
             rows.append(pool.outputs.tobytes())
         assert rows[:8] == rows[8:]
 
-    def test_states(self, make, fmus):
-        """They go to another pool as bytes."""
-        plan = masses([fmus[2], fmus[2]])
-        here, there = make(plan, MASSES), make(isolated(plan), MASSES)
-        for pool in (here, there):
-            pool.save_by(lambda: SaveMethod.STATE)
-            play(pool, 2)
-        bundle = pickle.loads(pickle.dumps(there.save_instances(np.arange(2))))
-        here.restore_instances(bundle, np.array([1, 0]), np.arange(2))
-        for _ in range(3):
-            assert np.array_equal(here.step()[0], there.step()[0][:, ::-1])
-
     @pytest.mark.parametrize("version", [1, 2, 3])
     def test_strings_and_messages(self, make, tmp_path, caplog, version):
         """The FMU logs its String; the message names the system and the component."""
@@ -259,23 +245,6 @@ def chain(first=None, **options):
     components = {"a": Component(first or pendulum, **options), "b": pendulum}
     connection = Connection("a.theta", "b.tau", gain=0.5, convert_units=False)
     return FMUSystem(components, [connection], step_size=0.02)
-
-
-def episodes(env, seed=3):
-    """The observations of a vector environment over the end of its episodes."""
-    env.action_space.seed(seed)
-    first, _ = env.reset(seed=seed)
-    return np.array([first, *(env.step(env.action_space.sample())[0] for _ in range(30))])
-
-
-class TestEnvironments:
-    def test_a_vector_environment(self):
-        results = []
-        for isolate in (False, True):
-            env = fmugym.FMUVectorEnv(lambda i=isolate: Chain(chain(isolate=i)), 3)
-            with contextlib.closing(env):
-                results.append(episodes(env))
-        assert results[0].tobytes() == results[1].tobytes()
 
 
 class TestFaults:

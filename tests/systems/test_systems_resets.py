@@ -5,7 +5,6 @@ The FMUs are those of ``zoo/quirks.c``; what is right is an episode of a fresh s
 
 import itertools
 import logging
-import os
 from contextlib import closing
 
 import numpy as np
@@ -23,6 +22,8 @@ from fmugym.pool.spec import ResetMethod
 from fmugym.tools import cli
 from fmugym.trial.trial import examine
 
+pytestmark = pytest.mark.usefixtures("trials")
+
 RESTORE, RESET, INSTANCE, LIBRARY, PROCESS = ResetMethod
 MIXES = [
     *((RESTORE, RESTORE, RESTORE), (RESTORE, RESET, INSTANCE), (RESTORE, INSTANCE, RESET)),
@@ -38,14 +39,6 @@ LENGTHS = (3, 25, 25, 4, 25, 25, 25, 3, 25, 25)
 @pytest.fixture(scope="module", name="fmu_of")
 def made(tmp_path_factory):
     return quirk_table.making_quirks(tmp_path_factory.mktemp("components"))
-
-
-@pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path_factory):
-    """Trials as users have them; the cache serves all tests of a session."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    cache = os.path.join(tmp_path_factory.getbasetemp(), "component verdicts")
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", cache)
 
 
 def chain(fmu_of, *tokens, version=2):
@@ -138,10 +131,6 @@ class TestMethods:
         # the reset of the first does nothing, so that only its restored state can be right
         assert found[2].tobytes() != right.tobytes()
         assert found[2].tobytes() == found[1].tobytes() != found[0].tobytes()
-
-    def test_two_liars_at_once(self, fmu_of):
-        system = chain(fmu_of, "well behaved", "reset does nothing", "restore forgets")
-        assert is_right(system, (RESTORE, INSTANCE, RESET))
 
     def test_without_a_function_for_resets(self, fmu_of, tmp_path):
         """Model exchange of FMI 1.0 has none: only this component is made anew."""

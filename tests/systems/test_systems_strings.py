@@ -1,7 +1,6 @@
 """Texts in systems: parameters of components, and of the system."""
 
 import gymnasium
-import numpy as np
 import pytest
 import ssp_tools
 import values_tools
@@ -79,14 +78,6 @@ def test_one_parameter_of_the_system_is_that_of_several(fmus):
     env.reset()
     assert env.state == (0.0, 1.0, 5.0), "without a text, each component starts as it would"
     env.close()
-
-
-def test_vector_environments_have_them(fmus, make_envs):
-    envs = make_envs(lambda: Env(labelled(fmus, b="b"), label="the same"), 3)
-    observations, _ = envs.reset()
-    assert observations.tolist() == [[8.0, 1.0, 8.0]] * 3
-    observations, *_ = envs.step(np.zeros(3, int))
-    assert observations.tolist() == [[8.0, 1.0, 8.0]] * 3
 
 
 @pytest.mark.parametrize(

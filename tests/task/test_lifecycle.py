@@ -59,11 +59,6 @@ class TestTemporaryFolders:
         run(OPEN_AND_STEP + ending, probe(version))
         assert list(temp_root.iterdir()) == []
 
-    def test_gone_after_an_uncaught_error(self, probe, temp_root):
-        code = "try:\n    " + (OPEN_AND_STEP + "1 / 0").strip().replace("\n", "\n    ")
-        run(code + "\nfinally:\n    raise SystemExit", probe(2))
-        assert list(temp_root.iterdir()) == []
-
     @in_turn({"stage": ["token", "library", "hook"], "version": MAJOR_VERSIONS})
     def test_gone_after_a_failed_construction(
         self, probe, tmp_path, version, temp_root, same_working_directory, stage

@@ -95,10 +95,6 @@ def play_vector(envs, index, actions=ACTIONS):
     return rows
 
 
-def vector_of(make_env, num_envs=3, **options):
-    return fmugym.FMUVectorEnv(make_env, num_envs, autoreset_mode="Disabled", **options)
-
-
 @pytest.fixture
 def halfway(opened):
     """Make an environment in the middle of its second episode."""
@@ -174,7 +170,7 @@ class TestSingle:
         env.close()
         twin.close()
 
-    def test_has_what_hooks_assign_to_attributes(self):
+    def test_has_what_hooks_assign_to_attributes(self, vector_of):
         class Counting(CartPoleEnv):
             def _update(self):
                 self.pushes = [*getattr(self, "pushes", []), self.time]
@@ -221,7 +217,7 @@ class TestVector:
         assert again.rewards.tolist() == [0.0, 0.0]
 
     @pytest.mark.parametrize("hooks", ["compiled", "array"])
-    def test_parameters_from_options_are_restored(self, hooks):
+    def test_parameters_from_options_are_restored(self, hooks, vector_of):
         envs = vector_of(Track, 2, hooks=hooks)
         envs.reset(seed=0, options={"model_parameters": {"b": 1e-3, "m": 0.2}})
         envs.step(np.ones((2, 1), np.float32))
@@ -230,18 +226,16 @@ class TestVector:
         envs.reset(seed=1)
         envs.restore_state(snapshot)
         assert play_vector(envs, 1) == expected
-        envs.close()
 
-    def test_deep_copies_are_in_the_same_episodes(self):
+    def test_deep_copies_are_in_the_same_episodes(self, vector_of):
         envs = vector_of(Track, 2)
         envs.reset(seed=0)
         envs.step(np.ones((2, 1), np.float32))
         twin = copy.deepcopy(envs)
         assert play_vector(twin, 1) == play_vector(envs, 1)
-        envs.close()
         twin.close()
 
-    def test_an_instance_that_died_goes_on(self, probe):
+    def test_an_instance_that_died_goes_on(self, probe, vector_of):
         """A snapshot from before a fatal error serves after it, also where states are replayed."""
         config = probe_config(model_parameters={"fault": 4, "fault_step": 3}, time_step=0.5)
         envs = vector_of(lambda: PlainEnv(probe(), config), 2)
@@ -254,7 +248,6 @@ class TestVector:
         observations = envs.restore_state(snapshot)
         assert observations.tolist() == first.observations.tolist()
         assert not envs.step(actions).truncated.any()
-        envs.close()
 
 
 class TestValues:
@@ -268,7 +261,7 @@ class TestValues:
         assert first != "snapshot"
         assert copy.deepcopy(first) is first
 
-    def test_of_several_are_taken_apart(self):
+    def test_of_several_are_taken_apart(self, vector_of):
         envs = vector_of(Track, 3)
         envs.reset(seed=0)
         snapshot = envs.save_state()
@@ -281,8 +274,6 @@ class TestValues:
         other = vector_of(Track, 3)
         other.restore_state(snapshot[[1, 1, 0]])
         assert other.save_state() == snapshot[[1, 1, 0]]
-        other.close()
-        envs.close()
 
     def test_outlive_their_environment(self, halfway):
         env = halfway()
@@ -299,13 +290,12 @@ class TestValues:
 
 
 class TestRefusals:
-    def test_before_the_first_reset(self):
+    def test_before_the_first_reset(self, vector_of):
         with Track() as env, pytest.raises(SimulationError, match="before the first reset"):
             env.save_state()
         envs = vector_of(Track)
         with pytest.raises(SimulationError, match="before the first reset"):
             envs.save_state()
-        envs.close()
 
     def test_of_another_config(self, halfway):
         snapshot = halfway().save_state()
@@ -335,7 +325,7 @@ class TestRefusals:
                 other.restore_state(snapshot)
             assert "'m'" not in str(refusal.value)
 
-    def test_of_what_is_no_snapshot_or_of_several(self, halfway):
+    def test_of_what_is_no_snapshot_or_of_several(self, halfway, vector_of):
         env = halfway()
         envs = vector_of(Track)
         envs.reset(seed=0)
@@ -348,7 +338,6 @@ class TestRefusals:
                 envs.save_state(where)
         with pytest.raises(ConfigError, match="as many, or one"):
             envs.restore_state(envs.save_state([0, 1]))
-        envs.close()
 
     def test_after_close(self, halfway):
         env = halfway()
@@ -380,20 +369,13 @@ class TestRefusals:
                     env.restore_state(model.save_state())
             env.step(ACTIONS[0])  # the episode goes on
 
-    def test_some_of_a_vector_that_was_never_reset(self, halfway):
+    def test_some_of_a_vector_that_was_never_reset(self, halfway, vector_of):
         envs = vector_of(Track)
         with pytest.raises(ConfigError, match="restored in all"):
             envs.restore_state(halfway().save_state(), [0])
-        envs.close()
 
 
-@pytest.fixture
-def tried(tmp_path, monkeypatch):
-    """Turn trials of FMUs on."""
-    monkeypatch.delenv("FMUGYM_PROBE")
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
-
-
+@pytest.mark.usefixtures("own_trials")
 class TestForeign:
     @pytest.mark.parametrize(
         ("token", "method"),
@@ -404,7 +386,7 @@ class TestForeign:
             ("slow, differs elsewhere", SaveMethod.COPY),
         ],
     )
-    def test_states_are_tried_in_a_second_process(self, tmp_path, tried, token, method):
+    def test_states_are_tried_in_a_second_process(self, tmp_path, token, method):
         path = make_fmu(tmp_path, token)
         for _ in range(2):  # the second time, the cache knows
             env = DemandingEnv(path)
@@ -420,7 +402,7 @@ class TestForeign:
                 assert [other.step(a)[0].tolist() for a in ACTIONS] == expected
             env.close()
 
-    def test_without_a_spare_instance_nothing_is_tried(self, tmp_path, tried):
+    def test_without_a_spare_instance_nothing_is_tried(self, tmp_path):
         path = make_fmu(tmp_path, "quick")
         with DemandingEnv(path, max_instances=1) as env:
             env.reset(seed=0)
@@ -429,7 +411,7 @@ class TestForeign:
             env.reset(seed=0)
             assert env.save_state().method is SaveMethod.STATE
 
-    def test_of_pythonfmu(self, tmp_path, tried):
+    def test_of_pythonfmu(self, tmp_path):
         builder = pytest.importorskip("pythonfmu.builder", reason="pythonfmu builds the FMU")
         path = builder.FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path)
 
@@ -484,13 +466,12 @@ def test_records_have_a_limit_and_say_so(halfway):
         env.save_state()
 
 
-def test_equal_episodes_have_equal_states(make_env):
+def test_equal_episodes_have_equal_states(make_env, vector_of):
     """However often they are saved."""
     envs = vector_of(PendulumEnv, 8)
     envs.reset(seed=0)
     snapshots = [envs.save_state() for _ in range(1000)]
     assert len({snapshot.bundle.states for snapshot in snapshots}) == 1
-    envs.close()
     assert isinstance(snapshots[0], Snapshot)
 
 

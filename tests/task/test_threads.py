@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from fmu_tools import PlainEnv, probe_config
 
-from fmugym import FMUEnv, SimulationError, bundled_fmu
+from fmugym import FMUEnv, SimulationError
 from fmugym.envs import CartPoleEnv
 from fmugym.task import alone
 from fmugym.task.readings import READINGS
@@ -125,33 +125,6 @@ def test_what_hooks_read_is_not_taken_out_of_the_pool_meanwhile(telling):
             telling.variables.copy()
         with pytest.raises(SimulationError, match="one thread at a time"):
             telling.done = True
-
-
-@WAYS
-def test_another_thread_is_refused_while_the_fmu_steps(hooks):
-    """A step of the FMU takes some hundredths of a second, in which others may run."""
-    config = {"model_input_names": "f", "model_output_names": "x", "time_step": 0.02}
-    path = bundled_fmu("CartPole")
-    env = begin(PlainEnv(path, config | {"substeps": 100_000}, hooks=hooks), hooks)
-    refused = threading.Event()
-
-    def play():
-        while not refused.is_set():
-            env.reset()
-            env.step(ACTION)
-
-    worker = threading.Thread(target=play)
-    worker.start()
-    end, told = time.monotonic() + 20, ""
-    while not told and time.monotonic() < end:
-        try:
-            env.read_variables("x")
-        except SimulationError as error:
-            told = str(error)
-    refused.set()
-    worker.join(20)
-    assert "read_variables" in told
-    env.close()
 
 
 @pytest.mark.parametrize("hooks", ["auto", "python"])

@@ -1,7 +1,12 @@
-"""Episodes as FMPy plays them: each on a fresh instance of a fresh copy of the library."""
+"""Episodes as FMPy plays them: each on a fresh instance of a fresh copy of the library.
+
+And as environments play them, for a comparison.
+"""
 
 import logging
 from dataclasses import replace
+
+import numpy as np
 
 from fmugym import FMU
 from fmugym.fmi import Status
@@ -56,3 +61,25 @@ def played(fmu, spec, rows, start_values):
 
 def as_floats(values):
     return [float(value) for value in values]
+
+
+def episode(env, actions):
+    """What an environment that was reset gives: the outputs as above, until its episode ends."""
+    rows = [list(env.state)]
+    for action in actions:
+        _, _, terminated, truncated, _ = env.step(action)
+        rows.append(list(env.state))
+        if terminated or truncated:
+            break
+    return rows
+
+
+def episodes(envs, actions):
+    """The same of each environment of a vector environment, until the first episode ends."""
+    rows = [np.array(envs.get_attr("state"))]
+    for action in actions:
+        _, _, terminated, truncated, _ = envs.step(action)
+        rows.append(np.array(envs.get_attr("state")))
+        if (terminated | truncated).any():
+            break
+    return np.swapaxes(rows, 0, 1).tolist()

@@ -60,7 +60,7 @@ def config_of(path):
     exec(compile(text, "made.py", "exec"), names)
     next(value for name, value in names.items() if name.endswith("Env"))()
     found["model_output_names"] = found["model_output_names"][:MOST_OUTPUTS]
-    return found | {"model_parameters": {}, "max_episode_steps": None}
+    return found | {"model_parameters": {}, "max_episode_steps": None, "on_fault": "raise"}
 
 
 def inputs_of(path, config, length, index):
@@ -104,15 +104,8 @@ def play_single(path, config):
     episodes = []
     for length in LENGTHS:
         env.reset()
-        rows = [list(env.state)]
-        for row in inputs_of(path, config, length, 0):
-            _, _, terminated, truncated, info = env.step(row if row.size else 0)
-            if truncated:
-                raise RuntimeError(info.get("fault", info))
-            rows.append(list(env.state))
-            if terminated:
-                break
-        episodes.append(rows)
+        rows = inputs_of(path, config, length, 0)
+        episodes.append(fresh.episode(env, rows if rows.size else [0] * length))
     env.close()
     return [episodes]
 
@@ -126,17 +119,9 @@ def play_vector(path, config, **options):
     episodes = []
     for length in LENGTHS:
         envs.reset()
-        rows = [np.array(envs.get_attr("state"))]
-        inputs = np.stack([inputs_of(path, config, length, i) for i in range(NUM_ENVS)], axis=1)
-        for row in inputs:
-            action = row if row.size else np.zeros(NUM_ENVS, np.int64)
-            _, _, terminated, truncated, infos = envs.step(action)
-            if truncated.any():
-                raise RuntimeError(str(infos.get("fault", infos)))
-            rows.append(np.array(envs.get_attr("state")))
-            if terminated.any():
-                break
-        episodes.append(np.swapaxes(rows, 0, 1).tolist())
+        rows = np.stack([inputs_of(path, config, length, i) for i in range(NUM_ENVS)], axis=1)
+        actions = rows if rows.size else np.zeros((length, NUM_ENVS), np.int64)
+        episodes.append(fresh.episodes(envs, actions))
     envs.close()
     return [list(episode) for episode in zip(*episodes, strict=True)]
 

@@ -16,11 +16,7 @@ def test_odd_hooks_raise_nothing_but_our_own_errors():
 
 
 def test_a_failure_is_reported(monkeypatch):
-    """The fuzzing is able to fail: with an exception, and with a reward that is passed on."""
-    monkeypatch.setattr(BatchEngine, "_completed", lambda *given: 1 / 0)
-    failures = fuzz_driver.run(fuzz_hooks.program, 60, seed="tests").failures
-    assert any("ZeroDivisionError: division by zero" in failure for failure in failures)
-    monkeypatch.undo()
+    """The fuzzing is able to fail: with a reward that is passed on."""
     monkeypatch.setattr(BatchEngine, "_handle_faults", lambda *given: None)
     failures = fuzz_driver.run(fuzz_hooks.program, 60, seed="tests", first=400).failures
     assert any(": rewards" in failure for failure in failures)

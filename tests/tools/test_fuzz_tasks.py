@@ -23,11 +23,7 @@ def test_mutated_tasks_are_played_or_refused_with_their_place():
 
 
 def test_a_failure_is_reported(monkeypatch):
-    """The fuzzing is able to fail: with an exception, and with errors without a place."""
-    monkeypatch.setattr(Entry, "child", lambda self, key: 1 / 0)
-    failures = fuzz_driver.run(fuzz_tasks.program, 5, seed="tests").failures
-    assert any("ZeroDivisionError" in failure for failure in failures)
-    monkeypatch.undo()
+    """The fuzzing is able to fail: with errors without a place."""
     monkeypatch.setattr(Entry, "error", lambda self, text: TaskError("something is wrong"))
     failures = fuzz_driver.run(fuzz_tasks.program, 5, seed="tests").failures
     assert any("does not say where" in failure for failure in failures)

@@ -29,11 +29,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def trials(monkeypatch, folder):
-    """Trials as users have them; the cache serves all tests of this module."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(folder / "cache"))
-    monkeypatch.setenv("LICENCES", "")  # of other tests, in the process that starts workers
+def no_licences(trials, monkeypatch):
+    """Those of other tests may be in the process that starts workers."""
+    monkeypatch.setenv("LICENCES", "")
 
 
 def make_pool(path, one_initialization):

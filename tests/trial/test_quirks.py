@@ -69,11 +69,8 @@ def make_fmu(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path, tmp_path_factory):
-    """Trials as users have them; the cache serves all tests of a session."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    cache = os.path.join(tmp_path_factory.getbasetemp(), "quirk verdicts")
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", cache)
+def elsewhere(trials, monkeypatch, tmp_path):
+    """One of the FMUs changes the working directory."""
     monkeypatch.chdir(tmp_path)
 
 
@@ -89,22 +86,11 @@ def reference(path, gain, length, index=0):
     return fresh.play(path, OUTPUTS, rows, STEP, {"gain": gain, "tau": 0.3})
 
 
-def play(env, length):
-    """Play an episode; returns the outputs."""
-    env.reset()
-    rows = [list(env.state)]
-    for value in inputs_of(length):
-        _, _, terminated, truncated, _ = env.step(np.array([value]))
-        rows.append(list(env.state))
-        if terminated or truncated:
-            break
-    return rows
-
-
 def assert_right(env, path):
     """Play episodes, each of which must equal that of a fresh instance; then close."""
     for length in LENGTHS:
-        rows = play(env, length)
+        env.reset()
+        rows = fresh.episode(env, inputs_of(length)[:, None])
         assert rows == reference(path, env.parameters["gain"], length)
     env.close()
 
@@ -126,12 +112,8 @@ def assert_vector_right(envs, path, gains=None):
         _, infos = envs.reset()
         now = infos["drawn"]["gain"] if gains is None else gains
         expected = [reference(path, now[i], length, i) for i in range(NUM_ENVS)]
-        rows = [np.array(envs.get_attr("state"))]
         actions = np.stack([inputs_of(length, i) for i in range(NUM_ENVS)], axis=1)
-        for action in actions[: len(expected[0]) - 1]:
-            envs.step(action[:, None])
-            rows.append(np.array(envs.get_attr("state")))
-        assert np.swapaxes(rows, 0, 1).tolist() == expected
+        assert fresh.episodes(envs, actions[:, :, None]) == expected
     envs.close()
 
 

@@ -37,12 +37,6 @@ class ScratchEnv(model_tools.GainEnv):
         super().__init__(path, fmugym.Uniform(0.5, 2.0), log_level, time_step=STEP)
 
 
-@pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path):
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
-
-
 def expected_outputs(gains, inputs):
     """By the same operations in the same order."""
     y, rows = np.zeros_like(gains), []
@@ -53,6 +47,7 @@ def expected_outputs(gains, inputs):
     return np.array(rows)
 
 
+@pytest.mark.usefixtures("own_trials")
 @pytest.mark.parametrize("kind", KINDS)
 def test_steps_in_threads_do_not_deviate(tmp_path, kind):
     path = scratch_fmu(tmp_path, kind)

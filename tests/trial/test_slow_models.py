@@ -24,10 +24,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path):
-    """Trials as users have them, with a cache for each test."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
+def no_licences(own_trials, monkeypatch):
     monkeypatch.setenv("LICENCES", "")
 
 

@@ -57,10 +57,8 @@ def make_fmu(tmp_path_factory):
 
 
 @pytest.fixture(autouse=True)
-def trials(monkeypatch, tmp_path, temp_root, same_working_directory):
-    """Trials as users have them, with a cache of their own; they leave nothing."""
-    monkeypatch.delenv("FMUGYM_PROBE", raising=False)
-    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
+def nothing_left(own_trials, temp_root, same_working_directory):
+    """Trials as users have them leave nothing."""
     yield
     assert list(temp_root.iterdir()) == []
 

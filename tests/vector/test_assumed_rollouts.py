@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from test_rollouts import WAYS, rows_of
-from test_snapshots import Track, vector_of
+from test_snapshots import Track
 
 import fmugym
 from fmugym import ConfigError
@@ -67,8 +67,12 @@ def root(task, steps=2):
         return env.save_state(), env.state[0], env.unwrapped.variables["clock"] + steps * DT
 
 
-def environments(task, way="compiled", count=2):
-    return vector_of(lambda: fmugym.load(task), count, **WAYS[way])
+@pytest.fixture
+def environments(vector_of):
+    def make(task, way="compiled", count=2):
+        return vector_of(lambda: fmugym.load(task), count, **WAYS[way])
+
+    return make
 
 
 def value_at(time, values, interpolation):
@@ -80,7 +84,7 @@ def value_at(time, values, interpolation):
 class TestData:
     @pytest.mark.parametrize("way", WAYS)
     @pytest.mark.parametrize("interpolation", ["linear", "previous"])
-    def test_in_closed_form(self, way, interpolation):
+    def test_in_closed_form(self, way, interpolation, environments):
         snapshot, speed, now = root(spinning(interpolation=interpolation))
         envs = environments(spinning(interpolation=interpolation), way)
         found = envs.rollout(snapshot, pushes(), data={"wind": (TIMES, OTHER)})
@@ -97,11 +101,10 @@ class TestData:
                 assert found.rewards[index, step] == pytest.approx(reward, abs=1e-9)
                 seen = [fast, wind(t), price(t), wind(t + HOUR), wind(t + 2 * HOUR)]
                 assert found.observations[index, step] == pytest.approx(seen, abs=1e-5)
-        envs.close()
 
     @pytest.mark.parametrize("way", WAYS)
     @pytest.mark.parametrize("interpolation", ["linear", "previous"])
-    def test_that_is_true_changes_no_bit(self, way, interpolation):
+    def test_that_is_true_changes_no_bit(self, way, interpolation, environments):
         task = spinning(interpolation=interpolation)
         snapshot, *_ = root(task)
         envs = environments(task, way)
@@ -111,9 +114,8 @@ class TestData:
         later = {"wind": (TIMES[10:] - 24 * HOUR, OWN[10:])}  # the same hours of the day before
         assert rows_of(envs.rollout(snapshot, pushes(), data=later)) != rows_of(plain)
         assert rows_of(envs.rollout(snapshot, pushes())) == rows_of(plain)
-        envs.close()
 
-    def test_that_is_true_changes_no_bit_of_the_house(self):
+    def test_that_is_true_changes_no_bit_of_the_house(self, vector_of):
         with open(HOUSE_TASK.with_name("house_year.csv"), newline="") as file:
             rows = list(csv.DictReader(file))
         times = np.array([float(row["time_s"]) for row in rows])
@@ -126,10 +128,9 @@ class TestData:
         actions = np.random.default_rng(0).uniform(0, 1, (N, 96, 1)).astype(np.float32)
         plain = envs.rollout(snapshot, actions)
         assert rows_of(envs.rollout(snapshot, actions, data=data)) == rows_of(plain)
-        envs.close()
 
     @pytest.mark.parametrize("way", WAYS)
-    def test_equals_an_environment_whose_data_that_is(self, way):
+    def test_equals_an_environment_whose_data_that_is(self, way, environments):
         """A policy, too, which reads forecasts; of two equal series one is exchanged."""
         snapshot, *_ = root(spinning())
         envs, same = environments(spinning(), way), environments(spinning(OTHER), way)
@@ -140,8 +141,6 @@ class TestData:
         for actions, horizon in ((pushes(), None), (policy, STEPS)):
             found = envs.rollout(snapshot, actions, horizon=horizon, data={"wind": (TIMES, OTHER)})
             assert rows_of(found) == rows_of(same.rollout(snapshot, actions, horizon=horizon))
-        envs.close()
-        same.close()
 
     @pytest.mark.parametrize(
         ("data", "reason"),
@@ -156,23 +155,21 @@ class TestData:
             ("wind", "'data'"),
         ],
     )
-    def test_that_is_refused(self, data, reason):
+    def test_that_is_refused(self, data, reason, environments):
         envs = environments(spinning())
         with pytest.raises(ConfigError, match=reason):
             envs.rollout(root(spinning())[0], pushes(), data=data)
-        envs.close()
 
-    def test_of_a_task_without_any(self):
+    def test_of_a_task_without_any(self, vector_of):
         envs = vector_of(Track, 2)
         envs.reset(seed=0)
         with pytest.raises(ConfigError, match="'wind'"):
             envs.rollout(None, np.zeros((2, 3, 1)), data={"wind": ([0.0], [1.0])})
-        envs.close()
 
 
 class TestOffsets:
     @pytest.mark.parametrize("way", WAYS)
-    def test_shift_what_hooks_read_but_not_the_fmu(self, way):
+    def test_shift_what_hooks_read_but_not_the_fmu(self, way, environments):
         snapshot, *_ = root(spinning())
         envs = environments(spinning(), way)
         plain = envs.rollout(snapshot, pushes())
@@ -182,9 +179,8 @@ class TestOffsets:
         assert shift[..., 0] == pytest.approx(np.full((N, STEPS), 2.5), abs=1e-5)
         assert not shift[..., 1:].any()
         assert rows_of(envs.rollout(snapshot, pushes())) == rows_of(plain)
-        envs.close()
 
-    def test_are_the_same_in_all_ways(self):
+    def test_are_the_same_in_all_ways(self, vector_of):
         results = []
         for way in WAYS:
             envs = vector_of(Track, 2, **WAYS[way])
@@ -193,20 +189,18 @@ class TestOffsets:
             found = envs.rollout(None, actions, offsets={"q": 0.1})
             assert found.observations.tolist() != envs.rollout(None, actions).observations.tolist()
             results.append(rows_of(found))
-            envs.close()
         assert results[0] == results[1] == results[2] == results[3]
 
     @pytest.mark.parametrize(
         ("offsets", "reason"),
         [({"q_dt": 1.0}, "'q_dot'"), ({"q_dot": "much"}, "offset of 'q_dot'"), (1.0, "'offsets'")],
     )
-    def test_that_are_refused(self, offsets, reason):
+    def test_that_are_refused(self, offsets, reason, environments):
         envs = environments(spinning())
         with pytest.raises(ConfigError, match=reason):
             envs.rollout(root(spinning())[0], pushes(), offsets=offsets)
-        envs.close()
 
-    def test_do_not_reach_a_step_of_a_class(self):
+    def test_do_not_reach_a_step_of_a_class(self, vector_of):
         class Own(Track):
             def step(self, action):
                 return super().step(action)
@@ -215,12 +209,11 @@ class TestOffsets:
         envs.reset(seed=0)
         with pytest.raises(ConfigError, match="a step of its own"):
             envs.rollout(None, np.zeros((2, 3, 1)), offsets={"q": 1.0})
-        envs.close()
 
 
 class TestSeed:
     @pytest.mark.parametrize("way", WAYS)
-    def test_gives_all_candidates_other_noise(self, way):
+    def test_gives_all_candidates_other_noise(self, way, environments):
         task = spinning(noise=0.5)
         snapshot, *_ = root(task)
         envs = environments(task, way, N)
@@ -237,9 +230,8 @@ class TestSeed:
         assert rows_of(again) == rows_of(found)
         other = envs.rollout(snapshot, same, seed=8)
         assert not (other.observations[..., 0] == found.observations[..., 0]).any()
-        envs.close()
 
-    def test_is_that_of_an_environment(self):
+    def test_is_that_of_an_environment(self, environments):
         """Without other draws, the noise is that of an episode with this seed."""
         task = spinning(noise=0.5)
         with fmugym.load(task) as env:
@@ -251,17 +243,15 @@ class TestSeed:
         assert rows_of(envs.rollout(here, pushes()[:1], seed=11)) == rows_of(
             envs.rollout(other, pushes()[:1])
         )
-        envs.close()
 
-    def test_that_is_refused(self):
+    def test_that_is_refused(self, environments):
         envs = environments(spinning())
         with pytest.raises(ConfigError, match="seed must be"):
             envs.rollout(root(spinning())[0], pushes(), seed=-1)
-        envs.close()
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_costs_are_those_of_the_infos(way):
+def test_costs_are_those_of_the_infos(way, environments):
     costs = {"effort": "abs(push)", "speed": {"expr": "max(q_dot, 0)", "limit": 9}}
     task = spinning() | {"costs": costs, "episode_length": "2h"}
     snapshot, *_ = root(task)
@@ -275,11 +265,10 @@ def test_costs_are_those_of_the_infos(way):
                 assert {name: one[index, step] for name, one in found.costs.items()} == paid
     assert found.lengths.tolist() == [10] * N
     assert not found.costs["effort"][:, 10:].any()
-    envs.close()
 
 
 @pytest.mark.parametrize("told", [3.0, {"of": "all"}, {"of": [1.0, 2.0, 3.0]}])
-def test_costs_are_no_others_that_a_class_tells(told):
+def test_costs_are_no_others_that_a_class_tells(told, vector_of):
     class Telling(Track):
         def _get_info(self):
             return {"costs": told}
@@ -287,10 +276,9 @@ def test_costs_are_no_others_that_a_class_tells(told):
     envs = vector_of(Telling, 2, hooks="per_env")
     envs.reset(seed=0)
     assert envs.rollout(None, np.zeros((2, 3, 1), np.float32)).costs == {}
-    envs.close()
 
 
-def test_costs_that_are_not_told_are_zero():
+def test_costs_that_are_not_told_are_zero(vector_of):
     """Two candidates tell none at all, and the other two from the third step on."""
 
     class Paying(Track):
@@ -303,7 +291,6 @@ def test_costs_that_are_not_told_are_zero():
     pushed = np.repeat([0.0, 0.0, 0.01, 0.01], 4).reshape(4, 4, 1).astype(np.float32)
     found = envs.rollout(start, pushed).costs["push"]
     assert found.tolist() == [[0.0] * 4] * 2 + [[0.0, 0.0, 2.0, 2.0]] * 2
-    envs.close()
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -118,27 +118,6 @@ def test_one_hook_may_stay_in_python(make, mode):
     assert run_side_by_side(isolated, here, 40)
 
 
-@pytest.mark.parametrize("cls", [Short, Tracking])
-def test_snapshots_rollouts_and_parameters(make, cls):
-    isolated, here = make(cls), make(cls, workers=None)
-    results = []
-    for envs in (isolated, here):
-        envs.reset(seed=4)
-        envs.action_space.seed(1)
-        actions = np.array([envs.action_space.sample() for _ in range(8)])
-        for action in actions[:3]:
-            envs.step(action)
-        snapshot = envs.save_state()
-        rolled = envs.rollout(snapshot[[0]], actions[3:].swapaxes(0, 1))
-        went_on = [envs.step(action) for action in actions[3:]]
-        envs.restore_state(snapshot)
-        again = envs.step(actions[3])
-        results.append((rolled.rewards, again[0], again[1], went_on[-1][0]))
-        require_equal(again[1], went_on[0][1])
-    for ours, theirs in zip(*results, strict=True):
-        require_equal(ours, theirs)
-
-
 def test_a_process_that_is_killed(make):
     """The episodes of its block end, and the next step starts them again."""
     isolated, here = make(Short, 4), make(Short, 4, workers=None)

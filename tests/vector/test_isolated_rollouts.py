@@ -11,7 +11,6 @@ from test_vector_program import Task
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import CART_POLE, require_equal
 
-import fmugym
 from fmugym import FMUVectorEnv
 from fmugym.vector import episodes
 
@@ -176,14 +175,3 @@ def test_an_index_outside_of_its_table(make):
     with pytest.raises(IndexError, match="outside of its table"):
         envs.rollout(None, np.zeros((N, 9, 2), np.float32))
     assert envs.rollout(None, np.zeros((N, 2, 2), np.float32)).lengths.tolist() == [2] * N
-
-
-def test_policies_and_other_hooks_go_step_by_step(make):
-    results = []
-    for workers in (3, None):
-        envs = make(fmugym.envs.PendulumEnv, workers=workers)
-        envs.reset(seed=1)
-        rolled = envs.rollout(None, lambda seen: -0.5 * seen[:, 2:], horizon=9)
-        results.append(rolled)
-    for ours, theirs in zip(*results, strict=True):
-        require_equal(ours, theirs)

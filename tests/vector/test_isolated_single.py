@@ -9,9 +9,7 @@ from process_tools import linux_only, wait_until
 from test_isolated_hooks import Sampled, TwoPendulums
 from test_single_compiled import (
     TASKS,
-    Counting,
     require_same,
-    require_same_snapshots,
     require_same_steps,
     same,
 )
@@ -122,10 +120,3 @@ def test_interrupts_in_a_step_end_the_episode(cart):
     assert env.inside.ended
     env.reset(seed=0)
     assert env.step(1)[1] == 1.0
-
-
-@pytest.mark.parametrize("cls", [TASKS[0], Counting])
-def test_snapshots(cls):
-    one, other = isolated(cls), here(cls)
-    require_same_snapshots(one, other)
-    one.close()

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from fmu_tools import PlainEnv, probe_config
-from test_snapshots import Track, vector_of
+from test_snapshots import Track
 
 from fmugym import ConfigError, SimulationError
 from fmugym.envs import CartPoleEnv, PendulumEnv
@@ -76,7 +76,7 @@ class TestValues:
         env.close()
 
     @in_turn({"threads": [1, 2], "cls": [CartPoleEnv, PendulumEnv]})
-    def test_of_many_candidates_in_several_rounds(self, cls, threads):
+    def test_of_many_candidates_in_several_rounds(self, cls, threads, vector_of):
         env = halfway(cls)
         envs = vector_of(cls, 67, hooks="compiled", threads=threads)
         snapshot, actions = env.save_state(), actions_for(env, 150, 40)
@@ -86,10 +86,9 @@ class TestValues:
         assert rows_of(few) == one_by_one(env, snapshot, actions[picked])
         alone = vector_of(cls, 1).rollout(snapshot, actions[picked])
         assert rows_of(alone) == rows_of(few)
-        envs.close()
 
     @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-    def test_from_the_present_episodes_which_go_on_afterwards(self, way):
+    def test_from_the_present_episodes_which_go_on_afterwards(self, way, vector_of):
         envs = vector_of(Track, N, **way)
         envs.reset(seed=0)
         actions = actions_for(envs.inside.prototype)
@@ -102,9 +101,8 @@ class TestValues:
             assert rows_of(found) == one_by_one(env, before, actions)
         step = envs.step(actions[:, 0])
         assert step.observations.tolist() == found.observations[:, 0].tolist()
-        envs.close()
 
-    def test_of_observations_that_are_dicts(self):
+    def test_of_observations_that_are_dicts(self, vector_of):
         class Named(Track):
             def _get_observation_space(self):
                 box = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
@@ -121,11 +119,10 @@ class TestValues:
             found = envs.rollout(snapshot, actions)
             results.append([found.observations[name].tolist() for name in ("q", "u")])
             assert found.observations["q"].shape == (N, HORIZON, 1)
-            envs.close()
         assert results[0] == results[1] == results[2]
 
     @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-    def test_of_a_policy(self, hooks):
+    def test_of_a_policy(self, hooks, vector_of):
         def policy(observations):
             return np.clip(-0.05 * observations[:, :1], -0.01, 0.01).astype(np.float32)
 
@@ -141,10 +138,9 @@ class TestValues:
                     observation, reward, *_ = env.step(policy(observation[None])[0])
                     assert observation.tolist() == found.observations[index, step].tolist()
                     assert reward == found.rewards[index, step]
-        envs.close()
 
 
-def test_from_one_root_no_state_is_serialized(monkeypatch):
+def test_from_one_root_no_state_is_serialized(monkeypatch, vector_of):
     """Planning costs one saved state, however many candidates there are."""
     env, envs = halfway(), vector_of(Track, N)
     snapshot, saved = env.save_state(), []
@@ -156,13 +152,12 @@ def test_from_one_root_no_state_is_serialized(monkeypatch):
     envs.reset(seed=0)  # now there are episodes to return to
     envs.rollout(snapshot, actions_for(env, 3 * N))
     assert saved == [N]
-    envs.close()
     env.close()
 
 
 class TestParameters:
     @in_turn({"way": WAYS, "version": ["2.0", "3.0"]})
-    def test_of_each_candidate(self, way, version):
+    def test_of_each_candidate(self, way, version, vector_of):
         """A tunable friction, also read by a hook; the same values set before the reset."""
 
         class Rubbing(Track):
@@ -188,9 +183,8 @@ class TestParameters:
                     assert reward == found.rewards[index, step]
         same = envs.rollout(snapshot, actions, parameters={"b": 1e-4})
         assert rows_of(same) == rows_of(envs.rollout(snapshot, actions))
-        envs.close()
 
-    def test_that_are_refused(self):
+    def test_that_are_refused(self, vector_of):
         env, envs = halfway(), vector_of(Track, 2)
         snapshot, actions = env.save_state(), actions_for(env, 2)
         for parameters, reason in (
@@ -203,12 +197,11 @@ class TestParameters:
         ):
             with pytest.raises(ConfigError, match=reason):
                 envs.rollout(snapshot, actions, parameters=parameters)
-        envs.close()
 
 
 class TestFaults:
     @in_turn({"hooks": ["compiled", "array", "per_env"], "policy": ["truncate", "terminate"]})
-    def test_end_a_candidate(self, probe, hooks, policy):
+    def test_end_a_candidate(self, probe, hooks, policy, vector_of):
         faults = {"fault": 3, "fault_step": 4}
         config = probe_config(model_parameters=faults, fault_reward=-7.0, on_fault=policy)
         envs = vector_of(lambda: PlainEnv(probe(), config), 2, hooks=hooks)
@@ -221,20 +214,18 @@ class TestFaults:
         assert ends[0].tolist() == [step == length - 1 for step in range(6)]
         assert found.rewards[0, length - 1 :].tolist() == [-7.0] + [0.0] * (6 - length)
         assert not envs.step(actions[:, 0]).truncated.any()
-        envs.close()
 
-    def test_raise_if_asked_for(self, probe):
+    def test_raise_if_asked_for(self, probe, vector_of):
         faults = {"fault": 3, "fault_step": 2}
         config = probe_config(model_parameters=faults, on_fault="raise")
         envs = vector_of(lambda: PlainEnv(probe(), config), 2)
         envs.reset(seed=0)
         with pytest.raises(SimulationError, match="environment 0"):
             envs.rollout(None, np.zeros((2, 6, *envs.single_action_space.shape), np.float32))
-        envs.close()
 
 
 class TestRefusals:
-    def test_of_actions(self):
+    def test_of_actions(self, vector_of):
         env = halfway(CartPoleEnv)
         snapshot = env.save_state()
         envs = vector_of(CartPoleEnv, 2)
@@ -250,9 +241,8 @@ class TestRefusals:
                 envs.rollout(snapshot, actions)
         with pytest.raises(ConfigError, match="3 steps, but horizon = 4"):
             envs.rollout(snapshot, np.zeros((2, 3), int), horizon=4)
-        envs.close()
 
-    def test_of_snapshots(self):
+    def test_of_snapshots(self, vector_of):
         env, envs = halfway(CartPoleEnv), vector_of(CartPoleEnv, 2)
         actions = np.zeros((3, 4), int)
         with pytest.raises(SimulationError, match="before the first reset"):
@@ -270,11 +260,9 @@ class TestRefusals:
             pass
         with pytest.raises(SimulationError, match="has ended"):
             envs.rollout(env.save_state(), actions)
-        envs.close()
 
-    def test_leaves_no_episodes_behind(self):
+    def test_leaves_no_episodes_behind(self, vector_of):
         env, envs = halfway(CartPoleEnv), vector_of(CartPoleEnv, 3)
         envs.rollout(env.save_state(), np.zeros((3, 4), int))
         with pytest.raises(SimulationError, match="before the first reset"):
             envs.step([0, 0, 0])
-        envs.close()

@@ -43,14 +43,18 @@ class Raising(Faulty):
     policy = "raise"
 
 
-def pair(task, hooks, mode, num_envs=6):
-    return tuple(
-        FMUVectorEnv(task, num_envs, autoreset_mode=mode, hooks=way) for way in (hooks, "per_env")
-    )
+@pytest.fixture
+def pair(make_envs):
+    def make(task, hooks, mode, num_envs=6):
+        return tuple(
+            make_envs(task, num_envs, autoreset_mode=mode, hooks=way) for way in (hooks, "per_env")
+        )
+
+    return make
 
 
 @in_each_mode({"task": [CART_POLE, Faulty, Truncating]}, KINDS)
-def test_done_is_that_of_single_environments(task, mode, hooks):
+def test_done_is_that_of_single_environments(task, mode, hooks, pair):
     ours, theirs = pair(task, hooks, mode)
     seen = set()
     for result in results_of_both(ours, theirs):
@@ -61,24 +65,20 @@ def test_done_is_that_of_single_environments(task, mode, hooks):
             assert list(done) == result[2].tolist()
         seen |= set(zip(result[2].tolist(), result[3].tolist(), strict=True))
     assert len(seen) > 1
-    ours.close()
-    theirs.close()
 
 
 @each_kind
-def test_the_callers_array_is_not_done(hooks):
+def test_the_callers_array_is_not_done(hooks, pair):
     ours, theirs = pair(CART_POLE, hooks, AutoresetMode.NEXT_STEP)
     for result in results_of_both(ours, theirs):
         expected = tuple(result[2].tolist())
         result[2][:] = ~result[2]
         assert ours.get_attr("done") == theirs.get_attr("done") == expected
         result[2][:] = expected
-    ours.close()
-    theirs.close()
 
 
 @each_kind
-def test_snapshots_have_done(hooks):
+def test_snapshots_have_done(hooks, pair):
     ours, theirs = pair(Faulty, hooks, AutoresetMode.DISABLED)
     for envs in ours, theirs:
         envs.reset(seed=1)
@@ -100,8 +100,6 @@ def test_snapshots_have_done(hooks):
         if ended.any():
             for envs in ours, theirs:
                 envs.reset(options={"reset_mask": ended})
-    ours.close()
-    theirs.close()
 
 
 @each_kind
@@ -116,7 +114,7 @@ def test_rollouts_leave_done(hooks, make_envs):
 
 
 @each_kind
-def test_an_error_in_episodes_with_options_leaves_no_other_done(hooks):
+def test_an_error_in_episodes_with_options_leaves_no_other_done(hooks, pair):
     """Such episodes are played on arrays, and an error may come within a step."""
     ours, theirs = pair(Raising, hooks, AutoresetMode.DISABLED, 3)
     for envs in ours, theirs:
@@ -127,8 +125,6 @@ def test_an_error_in_episodes_with_options_leaves_no_other_done(hooks):
     for _ in results_of_both(ours, theirs, [np.zeros(3, np.int64)] * 12, seed=5):
         for name in ("done", "action", "step_count", "previous_state"):
             assert ours.get_attr(name) == theirs.get_attr(name)
-    ours.close()
-    theirs.close()
 
 
 TASK = {
@@ -213,19 +209,15 @@ class Doomed(Broken):
 
 
 @in_each_mode({"task": [Broken, BrokenCut, Doomed]}, KINDS)
-def test_observations_have_done(task, mode, hooks):
+def test_observations_have_done(task, mode, hooks, pair):
     """Of a step whose FMU failed it is what the fault makes it; of a start, it is False."""
     ours, theirs = pair(task, hooks, mode)
     seen = {flag for result in results_of_both(ours, theirs) for flag in result[0][:, 1].tolist()}
     assert seen == ({0.0} if mode is AutoresetMode.SAME_STEP else {0.0, 1.0})
-    ours.close()
-    theirs.close()
 
 
 @in_each_mode({"task": [Judged, Cut]}, KINDS)
-def test_infos_of_faults_have_done(task, mode, hooks):
+def test_infos_of_faults_have_done(task, mode, hooks, pair):
     ours, theirs = pair(task, hooks, mode)
     infos = [result[4].get("final_info", result[4]) for result in results_of_both(ours, theirs)]
     assert any(np.any(told.get("_fault", False)) for told in infos)
-    ours.close()
-    theirs.close()

@@ -141,31 +141,6 @@ def test_the_form_is_that_of_gymnasium(task):
     theirs.close()
 
 
-def test_statistics_of_gymnasiums_wrapper():
-    ours = gym.make_vec("fmugym/CartPole-v0", NUM_ENVS, autoreset_mode="same_step")
-    theirs = SyncVectorEnv(
-        [functools.partial(gym.make, "fmugym/CartPole-v0")] * NUM_ENVS, autoreset_mode=SAME_STEP
-    )
-    statistics = gym.wrappers.vector.RecordEpisodeStatistics
-    first, second = statistics(ours), statistics(theirs)
-    first.reset(seed=3)
-    second.reset(seed=3)
-    told = 0
-    for actions in sampled_actions(ours, 80):
-        mine, other = first.step(actions)[4], second.step(actions)[4]
-        assert ("episode" in mine) == ("episode" in other)
-        if "episode" in mine:
-            mine["episode"].pop("t")
-            other["episode"].pop("t")
-            require_equal(mine["episode"], other["episode"])
-            require_equal(mine["_episode"], other["_episode"])
-            require_same_form(final(mine), final(other))
-            told += 1
-    assert told > 5
-    first.close()
-    second.close()
-
-
 def observations_in(objects):
     """The arrays in an array of objects."""
     for value in objects:

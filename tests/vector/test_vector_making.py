@@ -11,7 +11,6 @@ from vector_tools import HOOKS, Drawing, require_equal, require_pair_equal
 import fmugym
 from fmugym import ConfigError, SimulationError
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.making import make_with_pool
 
 NOTHING = np.zeros((3, 1), np.float32)
 
@@ -148,16 +147,6 @@ def test_what_was_made_is_closed_if_a_later_one_cannot_be_made(temp_root):
         with pytest.raises(SimulationError, match="closed"):
             env.reset()
     assert not list(temp_root.iterdir())
-
-
-def test_a_pool_of_other_options():
-    env = make_with_pool(Drawing, isolation="process")
-    native = Drawing()
-    require_equal(env.reset(seed=3)[0], native.reset(seed=3)[0])
-    env.close()
-    native.close()
-    with pytest.raises(SimulationError, match="closed"):
-        env.reset()
 
 
 class Failing(Drawing):

@@ -58,15 +58,6 @@ def test_functions_and_objects_that_refer_to_the_environment(cls, hooks):
     require_pair_equal(cls, steps=30, hooks=hooks)
 
 
-def test_a_hook_in_an_attribute_is_called():
-    env = RewardInAttribute()
-    env.reset(seed=1)
-    _, reward, _, truncated, info = env.step(np.zeros(1, np.float32))
-    assert (reward, truncated) == (2.0 * env.state[1], env.state[1] > 0.3)
-    assert info["speed"] == env.state[1]
-    env.close()
-
-
 class LowPass:
     """A filter with a state."""
 

@@ -4,7 +4,6 @@ from itertools import product
 
 import gymnasium as gym
 import numpy as np
-import pytest
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from vector_tools import (
@@ -18,7 +17,7 @@ from vector_tools import (
     run_side_by_side,
 )
 
-from fmugym import SimulationError, Uniform
+from fmugym import Uniform
 from fmugym.vector import FMUVectorEnv
 
 SAME_STEP, DISABLED = AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
@@ -85,60 +84,3 @@ def test_faults_beside_regular_ends(make_envs):
         ended, faulty = result[2] | result[3], result[1] == -7.0
         both += bool(faulty.any() and (ended & ~faulty).any())
     assert both > 2
-
-
-class Wide(Drawing):
-    """An output that a float32 cannot hold at the start of two thirds of the episodes."""
-
-    def __init__(self):
-        super().__init__(
-            model_parameters={"q_0": Uniform(-1e39, 1e39), "q_dot_0": 0.0}, max_episode_steps=2
-        )
-
-    def _get_action_space(self):
-        return gym.spaces.Discrete(2)
-
-    def _get_inputs(self):
-        return self.action * 0.0
-
-    def _is_done(self):
-        return False & (self.state[0] > 0)
-
-
-def too_wide(seed, episode):
-    """Whether an episode begins with an angle that is infinite as a float32."""
-    q_0 = np.random.default_rng(seed).uniform(-1e39, 1e39, episode + 1)[episode]
-    return abs(q_0) > np.finfo(np.float32).max
-
-
-@pytest.mark.parametrize("mode", [SAME_STEP, DISABLED], ids=lambda mode: mode.name)
-def test_a_first_observation_that_is_not_finite(mode, make_envs):
-    envs = make_envs(Wide, 1, hooks="compiled", autoreset_mode=mode)
-    envs.reset(seed=next(s for s in range(99) if not too_wide(s, 0) and too_wide(s, 1)))
-    envs.step(np.zeros(1, np.int64))
-    with pytest.raises(SimulationError, match="first observation is not finite"):
-        envs.reset() if mode is DISABLED else envs.step(np.zeros(1, np.int64))
-
-
-class TestGuards:
-    """The methods of the extension refuse arrays that do not fit."""
-
-    @pytest.fixture
-    def pool(self):
-        envs = FMUVectorEnv(CART_POLE, 4, hooks="compiled")
-        envs.reset(seed=0)
-        yield envs.inside.engine._pool._pool
-        envs.close()
-
-    def test_fitting_ones(self, pool):
-        actions = np.zeros(4, np.int64)
-        assert pool.play(actions, False)[1:] == (0, False, None)
-        assert pool.play(actions, True)[1:] == (0, False, None)
-
-    @pytest.mark.parametrize("actions", [np.zeros(3, np.int64), np.zeros(8, np.int64)[::2], 7])
-    def test_others(self, pool, actions):
-        for at_ends in (False, True):
-            with pytest.raises((TypeError, ValueError, BufferError)):
-                pool.play(actions, at_ends)
-        with pytest.raises(TypeError, match="expected 2 arguments"):
-            pool.play(np.zeros(4, np.int64))

@@ -8,19 +8,16 @@ in Python.
 from functools import partial
 from itertools import islice
 
-import gymnasium as gym
 import numpy as np
+import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
-    CART_POLE,
     Drawing,
     each_way,
     in_each_mode,
     results_of_both,
     sampled_actions,
 )
-
-from fmugym.vector import FMUVectorEnv
 
 COUNT, STEPS = 3, 6
 NAMES = (
@@ -43,15 +40,16 @@ class Told(Drawing):
         return {name: getattr(self, name) for name in NAMES}
 
 
-def pair(hooks, mode=AutoresetMode.NEXT_STEP, cls=Told):
-    """A vector environment, and single environments in Python."""
-    ours = FMUVectorEnv(cls, COUNT, hooks=hooks, autoreset_mode=mode)
-    return ours, SyncVectorEnv([partial(cls, "python")] * COUNT, autoreset_mode=mode)
+@pytest.fixture
+def pair(opened, make_envs):
+    """Make a vector environment, and single environments in Python."""
 
+    def make(hooks, mode=AutoresetMode.NEXT_STEP, cls=Told):
+        ours = make_envs(cls, COUNT, hooks=hooks, autoreset_mode=mode)
+        theirs = SyncVectorEnv([partial(cls, "python")] * COUNT, autoreset_mode=mode)
+        return ours, opened(theirs)
 
-def close(envs):
-    for one in envs:
-        one.close()
+    return make
 
 
 def plain(value):
@@ -71,27 +69,25 @@ ASKED = {
 
 
 @in_each_mode({"way": list(ASKED), "first": [1, 3]})
-def test_the_last_step_is_told_from_the_first_question_on(first, way, hooks, mode):
+def test_the_last_step_is_told_from_the_first_question_on(first, way, hooks, mode, pair):
     envs = ours, theirs = pair(hooks, mode)
     for count, _ in enumerate(results_of_both(*envs, STEPS, seed=0), 1):
         if count >= first:
             assert plain(ASKED[way](ours)) == plain(theirs.call("told")), count
-    close(envs)
 
 
 @in_each_mode({"count": [1, 2, 3]})
-def test_snapshots_hold_the_last_step(count, hooks, mode):
+def test_snapshots_hold_the_last_step(count, hooks, mode, pair):
     envs = ours, theirs = pair(hooks, mode)
     list(islice(results_of_both(*envs, STEPS, seed=0), count))
     for index, told in enumerate(theirs.call("told")):
         with Told("python") as other:
             other.restore_state(ours.save_state(index))
             assert plain(other.told()) == plain(told)
-    close(envs)
 
 
 @each_way
-def test_pictures_show_the_last_step(hooks):
+def test_pictures_show_the_last_step(hooks, pair):
     """The caption of this environment tells the action and the state before."""
     seen = []
 
@@ -109,41 +105,10 @@ def test_pictures_show_the_last_step(hooks):
     list(results_of_both(*envs, 1))
     ours.render()
     assert plain(tuple(seen)) == plain(theirs.call("told"))
-    close(envs)
 
 
 @each_way
-def test_values_set_by_methods_of_the_last_step(hooks):
-    """What a method assigns from the last step's values takes effect."""
-
-    class Bounded(Told):
-        bound = 10.0
-
-        def learn(self):
-            self.bound = abs(float(self.action[0])) + abs(self.previous_state[0])
-
-        def _reward_policy(self):
-            return self.bound * self.state[1]
-
-    both = pair(hooks, cls=Bounded)
-    for count, _ in enumerate(results_of_both(*both, 2)):
-        for envs in both if count == 0 else ():
-            envs.call("learn")
-    close(both)
-
-
-@each_way
-def test_integers_of_a_registered_environment(hooks):
-    ours = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
-    theirs = SyncVectorEnv([lambda: gym.make("fmugym/CartPole-v0", hooks="python")] * 2)
-    list(results_of_both(ours, theirs, list(np.array([[0, 1], [1, 1], [1, 0]]))))
-    for name in NAMES:
-        assert plain(ours.get_attr(name)) == plain(theirs.get_attr(name)), name
-    close((ours, theirs))
-
-
-@each_way
-def test_a_recorded_series_tells_the_state_before(hooks):
+def test_a_recorded_series_tells_the_state_before(hooks, pair):
     envs = ours, theirs = pair(hooks)
     actions = sampled_actions(ours, 1)
     list(results_of_both(*envs, actions))
@@ -152,7 +117,6 @@ def test_a_recorded_series_tells_the_state_before(hooks):
     )
     for row, one in zip(told.T, theirs.call("told"), strict=True):
         assert row.tolist() == [one["previous_state"][0], one["previous_action"][0]]
-    close(envs)
 
 
 def test_before_the_first_reset(make_envs):
