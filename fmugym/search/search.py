@@ -53,8 +53,9 @@ _STARTS: Final = 3
 """A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
 when that was so in each of these starts."""
 
+_RANDOM: Final = 64
 _BEST_PART: Final = 4
-"""This part of the candidates tells what observations are like."""
+"""Of so many candidates with weights at random, this part tells what observations are like."""
 
 _FINEST: Final = 1e-3
 """The smallest constants that candidates add without a controller; the largest ones are 1."""
@@ -234,11 +235,11 @@ class Search:
             width: How many weights they have, at random; the others are 0.
             finest: The size of the smallest weights; that of the largest ones is 1.
         """
-        sizes = np.geomspace(1.0, finest, _MANY)[:, None]
-        rows = agent.extended(sizes * self._rng.standard_normal((_MANY, width)))
+        sizes = np.geomspace(1.0, finest, _RANDOM)[:, None]
+        rows = agent.extended(sizes * self._rng.standard_normal((_RANDOM, width)))
         outcome = arena.play(agent, rows, self._training(self.episodes), has_moments=True)
         self.rounds += 1
-        best = outcome.moments[outcome.order[: _MANY // _BEST_PART]]
+        best = outcome.moments[outcome.order[: _RANDOM // _BEST_PART]]
         return scale_of(best.sum(axis=(0, 1)))
 
     # Who wins.
