@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.arena import MOST_STEPS, Arena, Outcome
 from fmugym.baselines.parsing import plans_ahead
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -93,21 +93,22 @@ class Probe:
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
-        def play(actions: int, most_steps: int) -> tuple[Any, float, Arena]:
+        def play(actions: int, most_steps: int) -> tuple[Arena, Outcome]:
             with closing(Arena(make_env, envs, most_steps)) as arena:
-                outcome = arena.play(linear, rows[:actions], range(_EPISODES), has_moments=True)
-                return outcome, arena.seconds / arena.steps, arena
+                acting = rows[:actions]
+                return arena, arena.play(linear, acting, range(_EPISODES), has_moments=True)
 
-        outcome, seconds, arena = play(_ACTIONS, _STEPS)
-        if arena.steps == outcome.costs.sum():
+        arena, outcome = play(_ACTIONS, _STEPS)
+        if arena.steps == outcome.costs[..., -1].sum():
             raise ConfigError(
                 f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
                 "'fmugym validate' tells more"
             )
         returns = outcome.returns
         seen = np.dstack([returns, outcome.moments])
-        if seconds < _QUICK:
-            _, seconds, _ = play(FEW, _TIMED)
+        timed = arena
+        if arena.seconds < _QUICK * arena.steps:
+            timed, _ = play(FEW, _TIMED)
         return cls(
             task,
             linear,
@@ -116,7 +117,7 @@ class Probe:
             length,
             is_same=not np.ptp(seen, axis=1).any(),
             only_return=float(returns[0, 0]) if np.ptp(returns) == 0 else None,
-            seconds=seconds,
+            seconds=timed.seconds / timed.steps,
             usual_steps=arena.longest if arena.longest < _STEPS else length or MOST_STEPS,
             left_out=[one.name for one in declared if one not in agents],
         )

@@ -83,4 +83,4 @@ def _beside(test: Mapping[str, Any], name: str, other: str) -> str:
         half *= scale
         text += f" ({size - half:.3g} to {size + half:.3g})"
         text += ", which may be chance," if half >= size else ""
-    return f"{text} in unseen episodes"
+    return text + " in unseen episodes" * (half is not None)
