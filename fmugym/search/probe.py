@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena, Outcome
+from fmugym.baselines.arena import MOST_STEPS, Arena
 from fmugym.baselines.parsing import plans_ahead
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -93,22 +93,19 @@ class Probe:
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
-        def play(actions: int, most_steps: int) -> tuple[Arena, Outcome]:
-            with closing(Arena(make_env, envs, most_steps)) as arena:
-                acting = rows[:actions]
-                return arena, arena.play(linear, acting, range(_EPISODES), has_moments=True)
-
-        arena, outcome = play(_ACTIONS, _STEPS)
-        if arena.steps == outcome.costs[..., -1].sum():
-            raise ConfigError(
-                f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
-                "'fmugym validate' tells more"
-            )
+        with closing(Arena(make_env, envs, _STEPS)) as arena:
+            seeds = range(_EPISODES)
+            outcome = arena.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
+            if arena.steps == outcome.costs[..., -1].sum():
+                raise ConfigError(
+                    f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
+                    "'fmugym validate' tells more"
+                )
+            if arena.seconds < _QUICK * arena.steps:
+                arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
+                arena.play(linear, rows, seeds)
         returns = outcome.returns
         seen = np.dstack([returns, outcome.moments])
-        timed = arena
-        if arena.seconds < _QUICK * arena.steps:
-            timed, _ = play(FEW, _TIMED)
         return cls(
             task,
             linear,
@@ -117,7 +114,7 @@ class Probe:
             length,
             is_same=not np.ptp(seen, axis=1).any(),
             only_return=float(returns[0, 0]) if np.ptp(returns) == 0 else None,
-            seconds=timed.seconds / timed.steps,
+            seconds=arena.seconds / arena.steps,
             usual_steps=arena.longest if arena.longest < _STEPS else length or MOST_STEPS,
             left_out=[one.name for one in declared if one not in agents],
         )
