@@ -27,6 +27,7 @@ from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA, read_plant
 from fmugym.plant.written import Written
 from fmugym.pool.backend.clocks import Clock, RealClock
+from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect"]
 
@@ -49,6 +50,28 @@ def _with_past(task: Task) -> Task:
     held = dict.fromkeys(actions, 0.0)  # what acts in the plant is known then
     warm_up = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**task.document, "warm_up": warm_up})
+
+
+class _Watching(WarmUp):
+    """Fills histories: the steps before the first observation, with what acts in the plant."""
+
+    def __init__(self, declared: WarmUp, feed: Feed, written: Written) -> None:
+        self.steps, self.writes = declared.steps, declared.writes
+        self._declared, self._feed, self._written = declared, feed, written
+
+    def begin(self, count: int) -> None:
+        """See ``WarmUp.begin``."""
+        self._declared.begin(count)
+
+    def inputs(self, env: Any) -> Any:
+        """See ``WarmUp.inputs``: wait, and see what has acted."""
+        values = self._declared.inputs(env)
+        self._feed.advance()
+        return self._written.over(np.array([np.ravel(value)[0] for value in values]))
+
+    def update(self, env: Any) -> None:
+        """See ``WarmUp.update``."""
+        self._declared.update(env)
 
 
 class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -152,7 +175,9 @@ def connect(
         for output in env.inside.spec.outputs:
             plant.require(output)
         env.inside.held = feed.held
-        _fill_histories(env, feed, written)
+        if env.inside.warm_ups is not None:
+            declared = env.inside.warm_ups.warm_up
+            env.inside.warm_ups = WarmUps(env, _Watching(declared, feed, written))
         model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(
@@ -167,18 +192,3 @@ def connect(
         stack.callback(poller.stop)
         feed.open(plant, poller, live)
         return Shadow(env, feed, written, copies, stack.pop_all())
-
-
-def _fill_histories(env: TaskEnv, feed: Feed, written: Written) -> None:
-    """Let steps before the first observation wait, and see what has acted."""
-    if env.inside.warm_ups is None:
-        return
-    warm_up = env.inside.warm_ups.warm_up
-    declared = warm_up.inputs
-
-    def inputs(env: Any) -> Any:
-        values = declared(env)
-        feed.advance()
-        return written.over(np.array([np.ravel(value)[0] for value in values]))
-
-    warm_up.inputs = inputs  # type: ignore[method-assign]  # of this one environment
