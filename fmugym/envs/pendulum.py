@@ -166,8 +166,10 @@ class PendulumEnv(FMUEnv):
 def _squared(value: Any) -> Any:
     """Square by the C library's ``pow``, as Gymnasium does; a product differs in a bit at times.
 
-    ``**`` multiplies arrays, and so does ``numpy.power`` where one exponent stands for all.
+    ``**`` multiplies arrays. Of float64, ``numpy.float_power`` comes nearest, as ``numpy.power``
+    has loops of its own on some processors; of float32, it would round in another way.
     """
     if isinstance(value, np.ndarray):
-        return np.power(value, np.full_like(value, 2.0))
+        power = np.power if value.dtype == np.float32 else np.float_power
+        return power(value, np.full_like(value, 2.0))
     return value**2
