@@ -101,6 +101,7 @@ class Arena:
         """Close the environments."""
         if self._envs is not None:
             self._envs.close()
+            self._envs = None
 
     def play(
         self,

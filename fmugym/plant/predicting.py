@@ -106,9 +106,9 @@ class Predictions:
         measured, seen = self._measured(), self._seen()
         found = [seen[best] + offsets for best, offsets in reversed(self._told)]
         for place, values in enumerate(found):
-            off = measured - values
-            self._sums[:, place] += is_new * [np.ones_like(off), off, off**2]
-        self._observer.follow(is_new * (measured - seen))
+            off = np.where(is_new, measured - values, 0.0)
+            self._sums[:, place] += [is_new, off, off**2]
+        self._observer.follow(np.where(is_new, measured - seen, 0.0))
         self._observer.correct(measured - seen, is_new)
         self._tell()
         return dict(zip(self.names, found[0].tolist(), strict=True))
