@@ -1,6 +1,7 @@
 """Exceptions of signal handlers are told from those of a user's objects."""
 
 import functools
+import os
 import re
 import signal
 from pathlib import Path
@@ -11,6 +12,7 @@ from fmu_tools import PlainEnv, probe_config, probe_fmu
 from vector_tools import Drawing
 
 import fmugym
+from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.signals import Ignoring, ordinary
 
 
@@ -179,3 +181,19 @@ def test_environments_can_be_made_while_it_is_handled(install):
     with pytest.raises(fmugym.ConfigError):
         envs.reset(options={"parameters": {"none": np.ones(2)}})
     envs.close()
+
+
+def test_a_folder_goes_although_its_removal_is_interrupted(install, monkeypatch):
+    install(ring_late)
+    folder = folder_name()
+    make_folder(folder)
+    (folder / "file").touch()
+
+    def interrupted(*arguments, **options):
+        monkeypatch.undo()
+        alarm()
+
+    monkeypatch.setattr(os, "unlink", interrupted)
+    with pytest.raises(TimeoutError):
+        remove_folder(folder, os.getpid())
+    assert not folder.exists()

@@ -71,7 +71,10 @@ def _is_own(owner: int) -> bool:
 
 def _remove(folder: Path) -> None:
     _leave(folder, _made_in.get(folder, tempfile.gettempdir()))
-    shutil.rmtree(folder, ignore_errors=True)
+    with Ignoring(OSError):  # an exception of a signal handler comes out, even a TimeoutError
+        shutil.rmtree(folder)
+    if folder.exists():  # something cannot be removed, such as a library in use on Windows
+        shutil.rmtree(folder, ignore_errors=True)
     _made_in.pop(folder, None)
 
 
