@@ -36,13 +36,15 @@ class Entrant:
             validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.
         then: What enters when this one gains nothing; None for nothing.
+        first: The candidates of the first round, shape (n, k); ``cma`` goes on from the best of
+            them. None if ``cma`` draws them.
         rounds: How many it has had.
         leader: The numbers of the best candidate since the last validation, shape (n,).
         lead: Its merit.
         best: The agent with the best numbers in validation; None before the first one.
         merit: Its merit.
         gained: The round in which it was found, or in which something was changed.
-        starts: How often the search has started anew.
+        starts: How often the search has started anew since then.
         agreement: The mean correlation of ranks by two halves of the episodes.
         last_round: The round of the whole search in which it played last.
     """
@@ -51,6 +53,7 @@ class Entrant:
     make: Any
     episodes: int
     then: Any = None
+    first: Any = None
     rounds: int = 0
     leader: Any = None
     lead: Merit = NO_MERIT
@@ -66,11 +69,15 @@ class Entrant:
 
         Ranks decide, so that the scale of rewards does not matter.
         """
-        found = self.cma.ask()
+        first, self.first = self.first, None
+        found = self.cma.ask() if first is None else first
         outcome = arena.play(self.make, found, seeds)
-        self.cma.tell(np.array(outcome.order))
-        self.rounds += 1
         best = outcome.order[0]
+        if first is None:
+            self.cma.tell(np.array(outcome.order))
+        else:
+            self.cma.mean = found[best]
+        self.rounds += 1
         reached = outcome.merits[best]
         if not reached <= self.lead:  # NaN included
             self.leader, self.lead = found[best], reached
@@ -109,7 +116,7 @@ class Entrant:
         if merits[1] > merits[0]:
             self.cma.mean = self.leader
         if not max(merits) <= self.merit:
-            self.merit, self.gained = max(merits), self.rounds
+            self.merit, self.gained, self.starts = max(merits), self.rounds, 0
             self.best = self.make.with_numbers(self.cma.mean)
         self.lead = NO_MERIT
 

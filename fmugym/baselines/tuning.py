@@ -17,11 +17,11 @@ from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["Axes", "Tuning", "tune"]
+__all__ = ["Tuning", "entrant_of", "numbers_at", "tune"]
 
 _LEAST_CANDIDATES: Final = 8
-_SIGMA: Final = 0.3
-"""Of the first candidates, as a part of the ranges."""
+_SIGMA: Final = 0.1
+"""Of candidates after the first round, as a part of the ranges, at most."""
 
 
 @dataclass(frozen=True)
@@ -41,28 +41,41 @@ class Tuning:
     returns: tuple[float, ...]
 
 
-class Axes:
-    """The numbers of a search by name, mapped to 0 to 1.
+def entrant_of(
+    make: Any,
+    ranges: Mapping[str, Uniform | LogUniform],
+    sizes: tuple[int, int],
+    episodes: int,
+    rng: np.random.Generator,
+) -> Entrant:
+    """A search for numbers, which begins everywhere and goes on from the best candidate.
 
     Args:
-        ranges: For each number a ``Uniform`` or a ``LogUniform``.
+        make: As for an ``Entrant``.
+        ranges: What ``numbers_at`` takes.
+        sizes: The candidates of the first round, and of the others.
+        episodes: How many each candidate plays.
+        rng: Draws them.
     """
+    first, others = sizes
+    places = rng.uniform(size=(first, len(ranges)))
+    cma = CMA(places[0], _SIGMA, others, rng, growth=1.0)
+    return Entrant(cma, make, episodes, first=places)
 
-    def __init__(self, ranges: Mapping[str, Uniform | LogUniform]) -> None:
-        self.ranges = ranges
 
-    def search(self, population: int, rng: np.random.Generator) -> CMA:
-        """A search that begins in the middle."""
-        return CMA(np.full(len(self.ranges), 0.5), _SIGMA, population, rng, growth=1.0)
+def numbers_at(
+    ranges: Mapping[str, Uniform | LogUniform], places: FloatArray
+) -> dict[str, FloatArray]:
+    """The numbers at places of shape (n, k), each of shape (n,).
 
-    def numbers(self, places: FloatArray) -> dict[str, FloatArray]:
-        """The numbers for places of shape (n, k), each of shape (n,).
-
-        For one place, of shape (k,), each is a number. Places beyond 0 and 1 are folded back.
-        """
-        folded = 1.0 - np.abs(1.0 - np.mod(places, 2.0))
-        pairs = zip(self.ranges.items(), folded.T, strict=True)
-        return {name: _value(given, column) for (name, given), column in pairs}
+    Args:
+        ranges: The range of each of the k numbers by name; it goes from place 0 to place 1.
+        places: For one place, of shape (k,), each is a number. Those beyond 0 and 1 are folded
+            back.
+    """
+    folded = 1.0 - np.abs(1.0 - np.mod(places, 2.0))
+    pairs = zip(ranges.items(), folded.T, strict=True)
+    return {name: _value(given, column) for (name, given), column in pairs}
 
 
 def _value(given: Uniform | LogUniform, places: FloatArray) -> FloatArray:
@@ -113,18 +126,23 @@ def tune(
         check_count(what, value)
     check_number("candidates", check_count("candidates", candidates), _LEAST_CANDIDATES)
     given = check_mapping("search", search)
-    axes = Axes({name: _range(name, one) for name, one in given.items()})
-    if not axes.ranges:
+    ranges = {name: _range(name, one) for name, one in given.items()}
+    if not ranges:
         raise ConfigError("search needs the name of at least one number")
     seed = check_seed(seed) or 0
-    cma = axes.search(candidates, np.random.default_rng(seed))
-    entrant = Entrant(cma, lambda rows: make_controller(**axes.numbers(rows)), episodes)
+    entrant = entrant_of(
+        lambda rows: make_controller(**numbers_at(ranges, rows)),
+        ranges,
+        (candidates, candidates),
+        episodes,
+        np.random.default_rng(seed),
+    )
     returns: list[float] = []
     with closing(Arena(make_env, most_steps=most_steps)) as arena:
         for _ in range(rounds):
             _, reached = entrant.play(arena, range(seed, seed + episodes))
             returns.append(reached)
-            best = {name: float(one) for name, one in axes.numbers(entrant.leader).items()}
+            best = {name: float(one) for name, one in numbers_at(ranges, entrant.leader).items()}
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
             if watch is not None:
                 watch(found)

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.controller import Controller, FloatArray, attribute_of, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
-from fmugym.baselines.tuning import Axes
+from fmugym.baselines.tuning import numbers_at
 from fmugym.errors import ConfigError, reading, shown
 from fmugym.search.flattening import choices_of, rows_of
 
@@ -94,7 +94,7 @@ class Agent:
         """
         if has_range(self.text):
             tunable = search_of(self.text)
-            return Policy(tunable.make(**Axes(tunable.ranges).numbers(rows)))
+            return Policy(tunable.make(**numbers_at(tunable.ranges, rows)))
         baseline = None if self.text is None else controller_of(self.text)
         return Policy(baseline, replace(self, weights=rows))
 
@@ -102,7 +102,7 @@ class Agent:
         """The agent with what was missing, shape (n,)."""
         if has_range(self.text):
             tunable = search_of(self.text)
-            return Agent(f"tuned {self.name}", tunable.text(Axes(tunable.ranges).numbers(found)))
+            return Agent(f"tuned {self.name}", tunable.text(numbers_at(tunable.ranges, found)))
         return replace(self, weights=found)
 
     def policy(self) -> Policy:

@@ -13,7 +13,7 @@ from fmugym.baselines.cma import CMA
 from fmugym.baselines.controller import FloatArray
 from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
-from fmugym.baselines.tuning import Axes
+from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
 from fmugym.search.probe import FEW, MOST_PROBED, Probe
 
@@ -26,7 +26,7 @@ _FINAL: Final = VALIDATION + 1000
 """The first seed of the last validation, in which all candidates compete."""
 
 _MANY: Final = 32
-"""The candidates of a round for policies."""
+"""The candidates of a round for policies, and of the first one for the numbers of a controller."""
 
 _EPISODES: Final = 4
 """Each candidate plays so many, or one if all are the same."""
@@ -40,8 +40,8 @@ _PART: Final = 5
 """The last validation has so many episodes for each agent, but in all no more than this part of the
 episodes of all rounds."""
 
-_TRIAL: Final = 10
-_TUNING: Final = 30
+_TRIAL: Final = 5
+_TUNING: Final = 20
 """Rounds for the numbers of each controller, and in all for those of the best one. A constant
 action is one, too."""
 
@@ -51,7 +51,7 @@ _SHARE: Final = 10
 _ROUNDS_WITHOUT_GAIN: Final = 15
 _STARTS: Final = 3
 """A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
-when that was so in each of these starts."""
+after so many starts in a row that were in vain."""
 
 _RANDOM: Final = 64
 _BEST_PART: Final = 4
@@ -153,10 +153,10 @@ class Search:
         return behind[0] if behind else min(leaders, key=lambda one: one.last_round)
 
     def _change(self, leader: Entrant) -> None:
-        """Give a leader that gains nothing more episodes, or a new start, which may be its last."""
-        if not leader.takes_more_episodes():
-            leader.starts += 1
-            leader.cma = self._cma(leader.best)
+        """Give a leader that gains nothing a new start with more episodes; it may be its last."""
+        leader.takes_more_episodes()
+        leader.starts += 1
+        leader.cma = self._cma(leader.best)
         leader.gained = leader.rounds
         if leader.then is not None:
             (start,) = leader.then.extended(leader.best.weights[None])
@@ -182,12 +182,13 @@ class Search:
     # Who takes part.
 
     def _entrant(self, agent: Agent, then: Agent | None = None) -> Entrant:
+        if has_range(agent.text):
+            ranges = search_of(agent.text).ranges
+            return entrant_of(agent, ranges, (_MANY, FEW), self.episodes, self._rng)
         return Entrant(self._cma(agent), agent, self.episodes, then)
 
     def _cma(self, agent: Agent) -> CMA:
-        """The search for what an agent lacks; that for weights begins with its own ones, or 0."""
-        if has_range(agent.text):
-            return Axes(search_of(agent.text).ranges).search(FEW, self._rng)
+        """The search for the weights of an agent, which begins with its own ones, or 0."""
         mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
         sigma = _OF_NETWORKS if agent.hidden else 1.0
         sigma *= 1.0 if agent.text is None else _OF_CORRECTIONS

@@ -222,8 +222,8 @@ class Searching:
         What an exception or the ceiling interrupts is a copy, so that those who resume or repeat
         the search come to the same agent.
         """
-        took = 0.0
-        while not self._is_over(took):
+        longest = 0.0
+        while not self._is_over(longest):
             begin, before = monotonic(), self._found
             self._arena.ceiling = self.steps - self._reserved(before)
             found = pickle.loads(pickle.dumps(before))
@@ -239,6 +239,7 @@ class Searching:
                 note(self.folder, ("steps", "reward", "baseline"), row)
                 self._save(found.best)
             took = monotonic() - begin
+            longest = max(longest, took)
             self.advance(took, self._text())
 
     def _reserved(self, found: Search) -> int:
@@ -246,8 +247,8 @@ class Searching:
         agents, seeds = found.last_validation()
         return len(agents) * len(seeds) * self._probe.most_steps
 
-    def _is_over(self, took: float) -> bool:
-        """Whether there is no time for another round like the last one, or nothing left to do."""
+    def _is_over(self, longest: float) -> bool:
+        """Whether there is no time for another round like the longest, or nothing left to do."""
         found = self._found
         if found.is_over or found.rounds >= self.rounds:
             return True
@@ -256,7 +257,7 @@ class Searching:
         done, seconds = self._arena.steps - self._before, monotonic() - self._begin
         # all episodes may end before they are as long as they may be
         pace = seconds / (done or 1) * self._arena.longest / self._probe.most_steps
-        return seconds + took + self._reserved(found) * pace >= self.seconds
+        return seconds + longest + self._reserved(found) * pace >= self.seconds
 
     def _text(self) -> str:
         """The scores, for a line of progress."""

@@ -848,7 +848,7 @@ def test_only_the_best_controller_is_tuned_to_the_end():
     search, field = search_of_agents(*(Agent(name, text) for name in names)), Uneven(1.0)
     while search.tuning:
         search.advance(field)
-    assert [one.rounds for one in search._tuned] == [10, 30, 10]
+    assert [one.rounds for one in search._tuned] == [5, 20, 5]
 
 
 def test_a_search_that_gains_nothing_ends():
@@ -1336,7 +1336,7 @@ class TestBudget:
             patch.setattr(searching, "monotonic", lambda: 0.0)
             limits = {"minutes": 0.05, "told": told}
             facts = searched(tmp_path / "a", rounds=np.inf, **limits)
-        assert facts["rounds"] == 30
+        assert facts["rounds"] == 20
         assert facts["agent"] == facts["baseline"] in {"lazy", "tuned pi"}
         assert any("only the baseline" in line and "--minutes 2" in line for line in told)
         more = searched(tmp_path / "a", rounds=ROUNDS, resume=True)
