@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
 
 import numpy as np
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.constants import ExcCodes
+from pymodbus.server import ModbusTcpServer
 
 from fmugym.errors import ConfigError, shown
-from fmugym.extras import imported
-from fmugym.plant.polling import Answer, LostError
+from fmugym.plant.polling import Answer, LostError, Values
 from fmugym.plant.tags import Plant, Tag
 
-__all__ = ["ModbusClient", "Values", "serve_modbus"]
+__all__ = ["PlantClient", "serve"]
 
 _PORT: Final = 502
 """That of Modbus TCP, where an address has none."""
@@ -33,8 +35,6 @@ _KINDS: Final = {
 """The functions that read, by what they read: their codes, and the library's names."""
 
 _BITS: Final = ("coil", "discrete")
-
-Values = Callable[[], Mapping[str, Sequence[float]]]
 
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
 
@@ -61,13 +61,8 @@ class _Place(NamedTuple):
         return one._replace(end=one.begin + tag.count * width)
 
 
-def _registers() -> Any:
-    """What makes numbers of registers, and registers of numbers."""
-    return imported("pymodbus.client.mixin", "plant").ModbusClientMixin
-
-
 def _type(tag: Tag) -> Any:
-    return _registers().DATATYPE[tag.address["type"].upper()]
+    return AsyncModbusTcpClient.DATATYPE[tag.address["type"].upper()]
 
 
 def _answer(place: _Place, cells: Sequence[Any]) -> Answer:
@@ -76,7 +71,7 @@ def _answer(place: _Place, cells: Sequence[Any]) -> Answer:
     tag = place.tag
     if not place.is_bits:
         order = tag.address["word_order"]
-        found = _registers().convert_from_registers(cells, _type(tag), order)
+        found = AsyncModbusTcpClient.convert_from_registers(cells, _type(tag), order)
     return Answer.of(tag, f"{place.kind} {place.begin}", [*np.ravel(found)])
 
 
@@ -89,7 +84,7 @@ def _cells(place: _Place, values: Sequence[float]) -> Sequence[int]:
     if "int" in tag.address["type"]:  # as converters: the nearest one, and the lowest one for NaN
         limits = np.iinfo(tag.address["type"])
         numbers = [round(min(max(limits.min, number), limits.max)) for number in numbers]
-    made: Sequence[int] = _registers().convert_to_registers(
+    made: Sequence[int] = AsyncModbusTcpClient.convert_to_registers(
         numbers, _type(tag), tag.address["word_order"]
     )
     return made
@@ -113,12 +108,10 @@ def _neighbours(places: Sequence[_Place]) -> list[list[_Place]]:
     return found
 
 
-class ModbusClient:
+class PlantClient:
     """Reads the tags of a plant; see ``polling.Client``."""
 
     def __init__(self, plant: Plant) -> None:
-        self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
-        self._codes = imported("pymodbus.constants", "plant").ExcCodes
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
         self._blocks = _neighbours(_places(plant))
@@ -128,7 +121,7 @@ class ModbusClient:
     async def connected(self) -> AsyncIterator[None]:
         """See ``polling.Client``."""
         options = {"timeout": self._timeout, "retries": 0, "reconnect_delay": 0}
-        self._client = self._client_of(self._host, port=self._port, **options)
+        self._client = AsyncModbusTcpClient(self._host, port=self._port, **options)
         try:
             if not await self._client.connect():
                 raise LostError("it refuses the connection, or does not answer")
@@ -159,7 +152,7 @@ class ModbusClient:
             count = min(_MOST, place.end - begin)
             told = await ask(begin, count=count, device_id=place.unit_id)
             if told.isError():
-                known, code = {one.value: one.name for one in self._codes}, told.exception_code
+                known, code = {one.value: one.name for one in ExcCodes}, told.exception_code
                 where = f"{place.kind} {begin} of unit {place.unit_id}"
                 return (), f"{where}: exception {code}, {known.get(code, 'unknown')}"
             cells += told.bits[:count] if place.is_bits else told.registers
@@ -180,7 +173,7 @@ def _host_and_port(address: str) -> tuple[str, int]:
 
 
 @asynccontextmanager
-async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
+async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback.
 
     Args:
@@ -191,13 +184,12 @@ async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator
     Yields:
         The address.
     """
-    server_of = imported("pymodbus.server", "plant").ModbusTcpServer
     places = _places(plant)
     for one, after in pairwise(places):
         if one[:2] == after[:2] and after.begin < one.end:
             text = f"it shares {one.kind} {after.begin} with {one.tag.name!r}"
             raise after.tag.entry.error(text)
-    server = server_of([], address=("127.0.0.1", port))
+    server = ModbusTcpServer([], address=("127.0.0.1", port))
     server.context = _Registers(places, values)
     await server.serve_forever(background=True)
     try:
@@ -211,7 +203,6 @@ class _Registers:
 
     def __init__(self, places: Sequence[_Place], values: Values) -> None:
         self._places, self._values = places, values
-        self._codes = imported("pymodbus.constants", "plant").ExcCodes
 
     # The library gives these methods their names.
 
@@ -224,9 +215,9 @@ class _Registers:
                 cells = _cells(one, now[one.tag.name])
                 found |= zip(range(one.begin, one.end), cells, strict=True)
         if not (found and min(found) <= begin and begin + count <= max(found) + 1):
-            return self._codes.ILLEGAL_ADDRESS
+            return ExcCodes.ILLEGAL_ADDRESS
         return [found.get(place, 0) for place in range(begin, begin + count)]
 
     async def async_setValues(self, *_: Any) -> Any:  # noqa: N802
         """Refuse who writes."""
-        return self._codes.ILLEGAL_FUNCTION
+        return ExcCodes.ILLEGAL_FUNCTION

@@ -11,25 +11,29 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from asyncua import Client, Server, ua
+from asyncua.common.utils import ServiceError
+from asyncua.crypto.cert_gen import setup_self_signed_certificate
+from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+from asyncua.crypto.uacrypto import CertProperties, load_certificate
+from cryptography import x509
+
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
-from fmugym.extras import imported
-from fmugym.plant.modbus import Values
-from fmugym.plant.polling import Answer, RefusedError
+from fmugym.plant.polling import Answer, RefusedError, Values
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
 from fmugym.signals import Ignoring
 
-__all__ = ["OpcUaClient", "serve_opcua"]
+__all__ = ["PlantClient", "serve"]
 
 logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
 
-class OpcUaClient:
+class PlantClient:
     """Reads the tags of a plant; see ``polling.Client``."""
 
     def __init__(self, plant: Plant) -> None:
-        self._ua, self._client_of = imported("asyncua.ua", "plant"), imported("asyncua", "plant")
         self._plant, self._tags = plant, list(plant.tags.values())
         self._address = plant.address if "://" in plant.address else f"opc.tcp://{plant.address}"
         with plant.entry.placing():
@@ -37,13 +41,12 @@ class OpcUaClient:
             self._keys = _keys_of(plant)
             if self._user is not None and self._keys is None:
                 raise ConfigError("without encryption, everybody on the line reads the password")
-        self._nodes = [_node_id(self._ua, tag) for tag in self._tags]
-        self._client: Any
+        self._nodes = [_node_id(tag) for tag in self._tags]
 
     @asynccontextmanager
     async def connected(self) -> AsyncIterator[None]:
         """See ``polling.Client``."""
-        self._client = self._client_of.Client(self._address, timeout=self._plant["timeout"])
+        self._client = Client(self._address, timeout=self._plant["timeout"])
         if self._user is not None:
             self._client.set_user(self._user[0])
             self._client.set_password(self._user[1])
@@ -57,9 +60,7 @@ class OpcUaClient:
                 await self._client.disconnect()
 
     async def _secure(self, certificate: Path, key: Path) -> None:
-        policies = imported("asyncua.crypto.security_policies", "plant")
-        x509, own = imported("cryptography.x509", "plant"), await _certificate_in(certificate)
-        for one in own.extensions:
+        for one in (await _certificate_in(certificate)).extensions:
             if isinstance(one.value, x509.SubjectAlternativeName):  # the application it is for
                 for uri in one.value.get_values_for_type(x509.UniformResourceIdentifier)[:1]:
                     self._client.application_uri = uri
@@ -67,13 +68,14 @@ class OpcUaClient:
         if pinned is not None:
             text = f"its certificate is not that of {shown(pinned)}"
             self._client.certificate_validator = await _only(pinned, partial(RefusedError, text))
-        policy = policies.SecurityPolicyBasic256Sha256
-        await self._client.set_security(policy, _content(certificate), _content(key))
+        await self._client.set_security(
+            SecurityPolicyBasic256Sha256, _content(certificate), _content(key)
+        )
 
     async def read(self) -> dict[str, Answer]:
         """See ``polling.Client``."""
-        attribute = self._ua.AttributeIds.Value
-        told = await self._client.uaclient.read_attributes(self._nodes, attribute)
+        read = self._client.uaclient.read_attributes
+        told = await read(self._nodes, ua.AttributeIds.Value)
         pairs = zip(self._tags, told, strict=True)
         return {tag.name: self._answer(tag, one) for tag, one in pairs}
 
@@ -91,7 +93,7 @@ class OpcUaClient:
         return Answer.of(tag, f"node {node}", numbers)
 
 
-def _node_id(ua: Any, tag: Tag) -> Any:
+def _node_id(tag: Tag) -> Any:
     try:
         return ua.NodeId.from_string(tag.address["node"])
     except ua.UaError:
@@ -131,59 +133,55 @@ async def _only(
 
 def _content(path: Path) -> Any:
     """What a file has, read at once: the library leaves files open when a poller is stopped."""
-    crypto = imported("asyncua.crypto.uacrypto", "plant")
-    return crypto.CertProperties(path.read_bytes(), path.suffix.removeprefix("."))
+    return CertProperties(path.read_bytes(), path.suffix.removeprefix("."))
 
 
 async def _certificate_in(path: Path) -> Any:
-    load, found = imported("asyncua.crypto.uacrypto", "plant").load_certificate, _content(path)
-    return await load(found.path_or_content, found.extension)
+    found = _content(path)
+    return await load_certificate(found.path_or_content, found.extension)
 
 
 # The server.
 
 
 @asynccontextmanager
-async def serve_opcua(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
-    """Serve tags on the loopback; see ``modbus.serve_modbus``.
+async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
+    """Serve tags on the loopback; see ``modbus.serve``.
 
     Where the plant encrypts, the server makes a certificate of its own, and takes all clients.
     """
-    ua, asyncua = imported("asyncua.ua", "plant"), imported("asyncua", "plant")
-    server = asyncua.Server()
+    server = Server()
     await server.init()
     server.set_server_name("fmugym")
     server.set_endpoint(f"opc.tcp://127.0.0.1:{port}")
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     if plant["encryption"]:
-        await _certify(server, ua, plant["certificate"])
+        await _certify(server, plant["certificate"])
     for tag in plant.tags.values():
-        await _add(server, ua, tag, values)
+        await _add(server, tag, values)
     async with server:
         yield f"opc.tcp://127.0.0.1:{server.bserver.port}"
 
 
-async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
+async def _certify(server: Server, trusted: str | None) -> None:
     """Encrypt with a new certificate, and take no other client than a given one."""
-    make = imported("asyncua.crypto.cert_gen", "plant").setup_self_signed_certificate
-    use = imported("cryptography.x509.oid", "plant").ExtendedKeyUsageOID.SERVER_AUTH
-    refused = imported("asyncua.common.utils", "plant").ServiceError
-    uri = "urn:fmugym:server"
+    uri, use = "urn:fmugym:server", [x509.oid.ExtendedKeyUsageOID.SERVER_AUTH]
     with TemporaryDirectory() as folder:
         key, certificate = Path(folder, "key.pem"), Path(folder, "certificate.der")
-        await make(key, certificate, uri, "localhost", [use], {"commonName": "fmugym"})
+        names = {"commonName": "fmugym"}
+        await setup_self_signed_certificate(key, certificate, uri, "localhost", use, names)
         await server.load_certificate(str(certificate))
         await server.load_private_key(str(key))
     await server.set_application_uri(uri)
     server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
     if trusted is not None:
-        untrusted = partial(refused, ua.StatusCodes.BadCertificateUntrusted)
+        untrusted = partial(ServiceError, ua.StatusCodes.BadCertificateUntrusted)
         server.set_certificate_validator(await _only(trusted, untrusted))
 
 
-async def _add(server: Any, ua: Any, tag: Tag, values: Values) -> None:
+async def _add(server: Server, tag: Tag, values: Values) -> None:
     """Add the node of a tag, whose value is found when somebody reads it."""
-    node = _node_id(ua, tag)
+    node = _node_id(tag)
     while node.NamespaceIndex >= len(await server.get_namespace_array()):
         await server.register_namespace(f"urn:fmugym:{len(await server.get_namespace_array())}")
     start = [0.0] * tag.count if tag.count > 1 else 0.0

@@ -5,17 +5,29 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from fmugym.errors import FMUGymError
+from fmugym.extras import imported
 from fmugym.plant.background import Background
-from fmugym.plant.tags import Tag
+from fmugym.plant.tags import Plant, Tag
 from fmugym.pool.backend.clocks import Clock, speed_of
 from fmugym.signals import ordinary
 
-__all__ = ["Answer", "Client", "LostError", "Poller", "RefusedError", "Round"]
+__all__ = [
+    "Answer",
+    "Client",
+    "LostError",
+    "Poller",
+    "RefusedError",
+    "Round",
+    "Values",
+    "protocol_of",
+]
+
+Values = Callable[[], Mapping[str, Sequence[float]]]
 
 _MOST: Final = 10_000
 """So many rounds are kept until they are used."""
@@ -57,6 +69,15 @@ class Round(NamedTuple):
 
     asked: float
     answers: dict[str, Answer]
+
+
+def protocol_of(plant: Plant) -> Any:
+    """The module of a plant's protocol, which has a ``PlantClient`` and ``serve``.
+
+    Raises:
+        ConfigError: If the extra ``plant`` is missing.
+    """
+    return imported(f"fmugym.plant.{plant['protocol']}", "plant")
 
 
 class Client(Protocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -18,8 +18,7 @@ from fmugym.declared.series import Series, read_data
 from fmugym.episodes.simulation import Player, Policy, Summary, action_of, policy_of
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
 from fmugym.plant.background import Background
-from fmugym.plant.modbus import serve_modbus
-from fmugym.plant.opcua import serve_opcua
+from fmugym.plant.polling import protocol_of
 from fmugym.plant.tags import DATA, Plant, Tag, read_plant
 from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 
@@ -207,8 +206,7 @@ class Server:
             policy, most = self._player.make_policy(env), self._steps or math.inf
             twin = _Twin(env, plant, policy, self._clock, self._seed, most)
             self.summary = twin.summary
-            serve = _SERVERS[plant["protocol"]]
-            async with serve(plant, self._port, twin.values) as self.address:
+            async with protocol_of(plant).serve(plant, self._port, twin.values) as self.address:
                 pause = plant.step / 2 / speed_of(self._clock)
                 is_over = False
                 while not is_over:
@@ -243,6 +241,3 @@ class Server:
 
     def __exit__(self, *reason: object) -> None:
         self.close()
-
-
-_SERVERS: Final[Mapping[str, Any]] = {"modbus": serve_modbus, "opcua": serve_opcua}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -19,9 +18,7 @@ from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
 from fmugym.plant.feed import Feed
 from fmugym.plant.live import Live
-from fmugym.plant.modbus import ModbusClient
-from fmugym.plant.opcua import OpcUaClient
-from fmugym.plant.polling import Poller
+from fmugym.plant.polling import Poller, protocol_of
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA, read_plant
@@ -30,8 +27,6 @@ from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect"]
-
-_CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
 
 def _watched(task: Task, feed: Feed) -> Task:
@@ -187,7 +182,7 @@ def connect(
             int(ahead / plant.step + 1e-9),
         )
         live = Live([env, *copies.envs], plant)
-        client = _CLIENTS[plant["protocol"]](plant)
+        client = protocol_of(plant).PlantClient(plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
         feed.open(plant, poller, live)
