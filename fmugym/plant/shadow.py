@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv, load
@@ -24,7 +23,6 @@ from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA, read_plant
 from fmugym.plant.written import Written
 from fmugym.pool.backend.clocks import Clock, RealClock
-from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect"]
 
@@ -45,28 +43,6 @@ def _with_past(task: Task) -> Task:
     held = dict.fromkeys(actions, 0.0)  # what acts in the plant is known then
     warm_up = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**task.document, "warm_up": warm_up})
-
-
-class _Watching(WarmUp):
-    """Fills histories: the steps before the first observation, with what acts in the plant."""
-
-    def __init__(self, declared: WarmUp, feed: Feed, written: Written) -> None:
-        self.steps, self.writes = declared.steps, declared.writes
-        self._declared, self._feed, self._written = declared, feed, written
-
-    def begin(self, count: int) -> None:
-        """See ``WarmUp.begin``."""
-        self._declared.begin(count)
-
-    def inputs(self, env: Any) -> Any:
-        """See ``WarmUp.inputs``: wait, and see what has acted."""
-        values = self._declared.inputs(env)
-        self._feed.advance()
-        return self._written.over(np.array([np.ravel(value)[0] for value in values]))
-
-    def update(self, env: Any) -> None:
-        """See ``WarmUp.update``."""
-        self._declared.update(env)
 
 
 class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -170,9 +146,6 @@ def connect(
         for output in env.inside.spec.outputs:
             plant.require(output)
         env.inside.held = feed.held
-        if env.inside.warm_ups is not None:
-            declared = env.inside.warm_ups.warm_up
-            env.inside.warm_ups = WarmUps(env, _Watching(declared, feed, written))
         model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(

@@ -23,7 +23,8 @@ class Written:
     """What acts in a plant, in the place of what an environment would write.
 
     Args:
-        env: The environment. Its hook ``_get_inputs`` becomes one that reads the plant.
+        env: The environment. Its hook ``_get_inputs`` becomes one that reads the plant, and so do
+            the inputs of its warm-up.
         feed: Has what acts.
         plant: Has the tags.
 
@@ -43,6 +44,16 @@ class Written:
         self._own = env._get_inputs
         # the hook of this one environment, whatever its class
         env._get_inputs = self._get_inputs  # type: ignore[method-assign]
+        if env.inside.warm_ups is not None:
+            warm_up = env.inside.warm_ups.warm_up
+            self._of_warm_up = warm_up.inputs
+            warm_up.inputs = self._warm_inputs  # type: ignore[method-assign]
+
+    def _warm_inputs(self, env: Any) -> FloatArray:
+        """Fill histories, before the first observation: wait, and see what has acted."""
+        values = self._of_warm_up(env)
+        self._feed.advance()
+        return self.over(np.array([np.ravel(value)[0] for value in values]))
 
     def _get_inputs(self) -> FloatArray:
         return self.over(flat_inputs(self._own(), [*self._inputs.values()], shown))
