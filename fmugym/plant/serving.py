@@ -6,7 +6,7 @@ import asyncio
 import math
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Self
 
@@ -45,10 +45,11 @@ def environment(task: Task, **arguments: Any) -> TaskEnv:
     raise ConfigError(f"a plant needs a declared task, got a {type(env).__name__}")
 
 
+@dataclass
 class _Twin:
     """An FMU that somebody controls, and its values as functions of time.
 
-    Args:
+    Attributes:
         env: The environment.
         plant: Has the tags.
         policy: Acts.
@@ -57,31 +58,32 @@ class _Twin:
         most: How many steps it has.
     """
 
-    def __init__(
-        self, env: TaskEnv, plant: Plant, policy: Policy, clock: Clock, seed: int, most: float
-    ) -> None:
-        self._env, self._plant, self._policy, self._clock = env, plant, policy, clock
-        self._seed, self._most = seed, most
-        assert env.inside.quantities is not None
-        assert env.inside.future is not None
-        quantities, self._future = env.inside.quantities(), env.inside.future
+    env: Any
+    plant: Plant
+    policy: Policy
+    clock: Clock
+    seed: int
+    most: float
+
+    def __post_init__(self) -> None:
+        quantities, data = self.env.inside.quantities(), self.env.task.root.child("data").items()
         self._read_all = quantities.read
         self._quantities = {one.name: one for one in quantities.all}
         self._sensors = self._places_of_sensors()
-        self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
-        policy.begin()
-        self._observation, _ = env.reset(seed=seed)
-        self._begin, self._steps, self._reward = clock.time(), 0, 0.0
+        self._data = {name: read_data(entry) for name, entry in data.items()}
+        self.policy.begin()
+        self._observation, _ = self.env.reset(seed=self.seed)
+        self._begin, self._steps, self._reward = self.clock.time(), 0, 0.0
         self._cost: float | None = None
         self._after = self._read()
         self._advance()
 
     def _places_of_sensors(self) -> dict[str, int]:
         """Where in the observation is what sensors show, by name."""
-        names = self._env.observation_names or ()
-        if "normalize" in self._env.unphysical_keys:
+        names = self.env.observation_names or ()
+        if "normalize" in self.env.unphysical_keys:
             return {}
-        declared = self._env.task.document.get("variables", {})
+        declared = self.env.task.document.get("variables", {})
         return {
             name: names.index(name)
             for name, one in self._quantities.items()
@@ -90,14 +92,14 @@ class _Twin:
         }
 
     def _read(self) -> dict[str, float]:
-        read = dict(zip(self._quantities, self._read_all(self._env), strict=True))
+        read = dict(zip(self._quantities, self._read_all(self.env), strict=True))
         seen = {name: self._observation[place] for name, place in self._sensors.items()}
         return {name: float(value) for name, value in (read | seen).items()}
 
     def _advance(self) -> None:
         self._before = self._after
-        action = self._policy.act(self._observation)
-        self._observation, reward, terminated, truncated, info = self._env.step(action)
+        action = self.policy.act(self._observation)
+        self._observation, reward, terminated, truncated, info = self.env.step(action)
         self._reward += float(reward)
         if "cost" in info:
             self._cost = (self._cost or 0.0) + float(info["cost"])
@@ -108,27 +110,27 @@ class _Twin:
 
     def summary(self) -> Summary:
         """What was reached until now."""
-        seconds = self._steps * self._plant.step
-        return Summary(self._seed, self._steps, seconds, self._reward, self._cost, "stopped")
+        seconds = self._steps * self.plant.step
+        return Summary(self.seed, self._steps, seconds, self._reward, self._cost, "stopped")
 
     @property
     def _passed(self) -> float:
         """How many steps have passed, with a part of one."""
-        return min((self._clock.time() - self._begin) / self._plant.step, self._most)
+        return min((self.clock.time() - self._begin) / self.plant.step, self.most)
 
     @property
     def is_over(self) -> bool:
         """Whether it has done its steps."""
-        return self._passed >= self._most
+        return self._passed >= self.most
 
     def values(self) -> dict[str, tuple[float, ...]]:
         """What all tags have now."""
         passed = self._passed
-        while self._steps <= passed and self._steps < self._most:
+        while self._steps <= passed and self._steps < self.most:
             self._advance()
         part = passed - (self._steps - 1)
-        time = float(self._future.clock(self._env)) + (part - 1.0) * self._plant.step
-        return {name: self._of_tag(tag, part, time) for name, tag in self._plant.tags.items()}
+        time = float(self.env.inside.future.clock(self.env)) + (part - 1.0) * self.plant.step
+        return {name: self._of_tag(tag, part, time) for name, tag in self.plant.tags.items()}
 
     def _of_tag(self, tag: Tag, part: float, time: float) -> tuple[float, ...]:
         """What a tag has when some part of a step has passed."""
