@@ -35,13 +35,12 @@ def _watched(task: Task, feed: Feed) -> Task:
 
 def _with_past(task: Task) -> Task:
     """The task with a warm-up that fills histories, if the agent sees some."""
-    agent = task.document.get("agent", {})
-    if "history" not in agent:
+    agent = task.root.child("agent")
+    history, actions = agent.child("history").value, agent.child("actions").value
+    if not history or not actions:
         return task
-    actions = agent["actions"]
-    actions = [actions] if isinstance(actions, str) else actions
     held = dict.fromkeys(actions, 0.0)  # what acts in the plant is known then
-    warm_up = {"period": agent["history"]["length"], "controller": held}
+    warm_up = {"period": history["length"], "controller": held}
     return replace(task, document={**task.document, "warm_up": warm_up})
 
 
