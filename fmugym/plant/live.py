@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.units import conversion_between
-from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
 from fmugym.declared.series import read_rows
 from fmugym.errors import ConfigError, shown
@@ -32,7 +31,7 @@ class Live:
         ConfigError: If the agent sees data that have no live source, or not far enough ahead.
     """
 
-    def __init__(self, envs: Sequence[TaskEnv], plant: Plant) -> None:
+    def __init__(self, envs: Sequence[Any], plant: Plant) -> None:
         self._envs = envs
         root = envs[0].task.root
         self._entries = plant.entry.child("data").items()
@@ -95,8 +94,8 @@ class Live:
             values = np.array(tags[DATA + name])
             return now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values
         times, values = read_rows(entry)
-        unit = conversion_between(entry.value.get("unit"), self._own[name], self._units)
-        values = values * unit.factor + unit.offset
+        unit: Any = conversion_between(entry.value.get("unit"), self._own[name], self._units)
+        values = unit(values)
         holds = entry.value["interpolation"] == "previous"
         end = times[-1] + (times[-1] - times[-2] if holds and len(times) > 1 else 0.0)
         ahead = self._ahead[name]
@@ -116,8 +115,7 @@ class Live:
         before = np.array(past)[:-1].reshape(-1, 2).T
         times, values = np.append(before[0], times), np.append(before[1], values)
         for env in self._envs:
-            lookup = None if env.inside.future is None else env.inside.future.lookups.get(name)
-            if lookup is not None:
+            if lookup := env.inside.future.lookups.get(name):
                 fits = times < times[0] + lookup.period
                 table = lookup.table_of(name, (times[fits], values[fits]))
                 lookup.tables[lookup.key] = table

@@ -121,8 +121,8 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
 
 
 def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
-    quantities = env.inside.quantities
-    known = {one.name: one for one in (quantities().all if quantities else ())}
+    inside: Any = env.inside
+    known = {one.name: one for one in inside.quantities().all}
     others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
     for name, one in entry.child("tags").items().items():
         if name in known:
@@ -153,14 +153,11 @@ def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
 
 def _tag(env: TaskEnv, name: str, entry: Entry, unit: str, **others: Any) -> Tag:
     given = entry.value
-    _require_protocol(entry, env.task.root.child("plant").child("protocol").value)
+    protocol = env.task.root.child("plant").child("protocol").value
+    key = "node" if protocol == "opcua" else "register"
+    if key not in given:
+        raise entry.error(f"the protocol {protocol!r} needs the key {key!r}")
     with entry.placing():
         own = conversion_between(given.get("unit"), unit or None, env.fmu.description.units)
     raw = Conversion(given["scale"], given["offset"])
     return Tag(name, entry, given, own.after(raw), given.get("count", 1), **others)
-
-
-def _require_protocol(entry: Entry, protocol: str) -> None:
-    key = "node" if protocol == "opcua" else "register"
-    if key not in entry.value:
-        raise entry.error(ConfigError(f"the protocol {protocol!r} needs the key {key!r}"))
