@@ -43,6 +43,7 @@ class Feed:
         clock: The monotonic clock of ticks and readings.
 
     Attributes:
+        plant: Has the tags; whoever makes the environment sets it.
         values: The present values of the tags, in the task's units.
         faults: What is wrong, by the names of tags whose last value goes on.
         has_expired: Whether the last value of one has held for too long.
@@ -51,6 +52,7 @@ class Feed:
     """
 
     samples_outputs = True
+    plant: Plant
 
     def __init__(self, clock: Clock) -> None:
         self.clock, self._start = clock, _local_time() - clock.time()
@@ -58,29 +60,28 @@ class Feed:
         self.faults: dict[str, str] = {}
         self.has_expired, self.time, self.jump = False, 0.0, 0.0
 
-    def open(self, plant: Plant, poller: Poller, live: Live) -> None:
+    def open(self, poller: Poller, live: Live) -> None:
         """Begin to read.
 
         Args:
-            plant: Has the tags.
-            poller: Reads them.
+            poller: Reads the tags of the plant.
             live: Gets the data of each tick.
         """
-        self._plant, self._poller, self._live = plant, poller, live
-        self._asked = dict.fromkeys(plant.tags, -np.inf)
+        self._poller, self._live = poller, live
+        self._asked = dict.fromkeys(self.plant.tags, -np.inf)
         self._ahead, self._has_begun = 0.0, False
 
     def row(self) -> dict[str, float]:
         """What the FMU's variables have at this tick, in its units, by name."""
         return {
             tag.variable.name: tag.to_task.inverse(self.values[name][0])
-            for name, tag in self._plant.tags.items()
+            for name, tag in self.plant.tags.items()
             if tag.variable
         }
 
     def held(self) -> list[str]:
         """The names of the FMU's variables whose last values go on."""
-        tags = [self._plant.tags.get(name) for name in self.faults]
+        tags = [self.plant.tags.get(name) for name in self.faults]
         return [tag.variable.name for tag in tags if tag and tag.variable]
 
     def told(self) -> str:
@@ -120,47 +121,46 @@ class Feed:
             SimulationError: If there are none in time. Once there were some, it waits for ever.
         """
         self._wait_for_values()
-        self._ahead, step = self._seen_ahead(), self._plant.step
+        self._ahead, step = self._seen_ahead(), self.plant.step
         now = self.clock.time() + self._ahead
         self.time, self.jump = now + (-now % step), 0.0
-        self._live.begin()
         self._sleep()
         if self.has_expired and not self._has_begun:
             raise SimulationError(self._told())
         self._has_begun = True
 
     def _wait_for_values(self) -> None:
-        deadline = time.monotonic() + 2.0 * self._plant["timeout"]
+        deadline = time.monotonic() + 2.0 * self.plant["timeout"]
         poller = self._poller
         while True:
             has_answered, is_refused = bool(poller.answers), poller.is_refused
-            self._look(self.clock.time() - self._plant.step, self.clock.time())
+            self._look(self.clock.time() - self.plant.step, self.clock.time())
             if not self.faults:
                 self._require_fit()
                 return
             time.sleep(0.005)
             if self._has_begun:
                 continue
-            if has_answered and any(map(poller.trouble, self._plant.tags)):
+            if has_answered and any(map(poller.trouble, self.plant.tags)):
                 raise ConfigError(self._told())
             if is_refused or time.monotonic() > deadline:
                 raise SimulationError(self._told())
 
     def _told(self) -> str:
-        return f"the plant at {self._plant.address}: {self.told()}"
+        return f"the plant at {self.plant.address}: {self.told()}"
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""
-        for name, tag in self._plant.tags.items():
+        for name, tag in self.plant.tags.items():
             if strange := tag.misfit(self.values[name][0]):
-                raise ConfigError(f"the plant at {self._plant.address}: {name}: {strange}")
+                raise ConfigError(f"the plant at {self.plant.address}: {name}: {strange}")
 
     def advance(self) -> None:
         """Wait for the next tick; what was read until then becomes present."""
-        self.time += self._plant.step
+        self.time += self.plant.step
         self._sleep()
         off = self._seen_ahead() - self._ahead
-        tolerance = max(min(_LEAST_JUMP, self._plant.step), _LATE * speed_of(self.clock))
+        tolerance = max(min(_LEAST_JUMP, self.plant.step), _LATE * speed_of(self.clock))
         self.jump = off if abs(off) > tolerance else 0.0
         if not self.jump:
             self._ahead += min(off, 0.0)  # an answer is late, and never early
@@ -168,7 +168,7 @@ class Feed:
     def _sleep(self) -> None:
         tick = self.time - self._ahead
         self.clock.sleep(tick - self.clock.time())
-        self._look(tick - self._plant.step, tick)
+        self._look(tick - self.plant.step, tick)
         faults = self._live.refresh(self.time, self.values)
         self.faults |= faults
         self.has_expired |= bool(faults)
@@ -193,18 +193,18 @@ class Feed:
                 self.values[name], asked = self._sampled(name, numbers), fresh[-1].asked
                 self._asked[name] = asked
             age = end - asked
-            if age > self._plant.stale_after:
+            if age > self.plant.stale_after:
                 why = self._poller.trouble(name) or "no answer has come in time"
                 self.faults[name] = f"{why} (for {age:.6g} s)" if name in self.values else why
-            if age > self._plant.stale_after + self._plant.hold:
+            if age > self.plant.stale_after + self.plant.hold:
                 self.has_expired = True
 
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
         """What a step gives of its readings, a row for each."""
-        how = self._plant.tags[name].sampling
+        how = self.plant.tags[name].sampling
         found = numbers[-1] if how == "last" else _SAMPLED[how](numbers, axis=0)
         if how == "integral":
-            found = found * self._plant.step
+            found = found * self.plant.step
         return tuple(found.tolist())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -40,10 +39,9 @@ class Live:
             if name not in self._entries:
                 text = f"the agent sees {name!r}: say in [plant.data] where it comes from"
                 raise root.child("data").child(name).error(text)
-        steps = (root.child("agent").child("history").value or {}).get("length", 0.0) / plant.step
-        self._past: dict[str, deque[tuple[float, float]]] = {
-            name: deque(maxlen=int(steps) + 3) for name in self._entries
-        }
+        history = root.child("agent").child("history").value or {}
+        self._kept = history.get("length", 0.0) + 3 * plant.step
+        self._past: dict[str, list[tuple[float, float]]] = {name: [] for name in self._entries}
         self._require_tags()
         self._units = envs[0].fmu.description.units
         self._own = {name: root.child("data").child(name).value.get("unit") for name in self._past}
@@ -60,11 +58,6 @@ class Live:
                     f"the agent sees {ahead:g} s ahead: expected 'count' values that are "
                     f"'step' apart to go as far, got {count} and {step}"
                 )
-
-    def begin(self) -> None:
-        """Forget the values before."""
-        for past in self._past.values():
-            past.clear()
 
     def refresh(self, now: float, tags: dict[str, tuple[float, ...]]) -> dict[str, str]:
         """Let environments look up what is known now.
@@ -109,10 +102,10 @@ class Live:
         return np.append(now, times[first:]), np.append(present, values[first:])
 
     def _write(self, name: str, times: FloatArray, values: FloatArray) -> None:
-        past = self._past[name]
-        if not past or past[-1][0] < times[0]:
-            past.append((float(times[0]), float(values[0])))
-        before = np.array(past)[:-1].reshape(-1, 2).T
+        past, now = self._past[name], float(times[0])
+        past[:] = [one for one in past if now - self._kept < one[0] < now]
+        before = np.reshape(past, (-1, 2)).T
+        past.append((now, float(values[0])))
         times, values = np.append(before[0], times), np.append(before[1], values)
         for env in self._envs:
             if lookup := env.inside.future.lookups.get(name):

@@ -12,7 +12,6 @@ import numpy as np
 from fmugym.baselines.observer import COPIES, Observer, spread
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant
 from fmugym.plant.written import Written
 from fmugym.pool.base import FloatArray
 
@@ -44,8 +43,7 @@ class Predictions:
 
     Args:
         make_env: Makes an environment with the time of the plant, which the caller closes.
-        feed: Has what the plant does.
-        plant: Has the tags.
+        feed: Has what the plant does, and the tags.
         steps: How many steps ahead there are predictions.
 
     Attributes:
@@ -53,15 +51,13 @@ class Predictions:
         envs: The environments of the copies.
     """
 
-    def __init__(
-        self, make_env: Callable[[], TaskEnv], feed: Feed, plant: Plant, steps: int
-    ) -> None:
-        self._feed, self._plant = feed, plant
+    def __init__(self, make_env: Callable[[], TaskEnv], feed: Feed, steps: int) -> None:
+        self._feed = feed
         self.envs = [make_env()] if steps else []
         self._spread = spread(self.envs[0], 0) if steps else {}
         self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
-        self._written = [Written(env, feed, plant) for env in self.envs]
-        self._tags = plant.of(self.envs[0].inside.spec.outputs) if steps else []
+        self._written = [Written(env, feed) for env in self.envs]
+        self._tags = feed.plant.of(self.envs[0].inside.spec.outputs) if steps else []
         self.names = [tag.name for tag in self._tags]
         # of the errors, by horizon and variable: how many, their sum, and that of their squares
         self._sums = np.zeros((3, steps, len(self.names)))
@@ -124,6 +120,6 @@ class Predictions:
         found = []
         for place, ahead in np.argwhere(self._sums[0].T).tolist():
             count, total, squares = self._sums[:, ahead, place].tolist()
-            seconds, rms = (ahead + 1) * self._plant.step, math.sqrt(squares / count)
+            seconds, rms = (ahead + 1) * self._feed.plant.step, math.sqrt(squares / count)
             found.append(Error(self.names[place], seconds, rms, total / count, int(count)))
         return found

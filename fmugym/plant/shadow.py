@@ -140,8 +140,8 @@ def connect(
     own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
         env = stack.enter_context(closing(environment(own, backend=feed)))
-        plant = read_plant(env, address)
-        written = Written(env, feed, plant)
+        feed.plant = plant = read_plant(env, address)
+        written = Written(env, feed)
         for output in env.inside.spec.outputs:
             plant.require(output)
         env.inside.held = feed.held
@@ -150,12 +150,11 @@ def connect(
         copies = Predictions(
             lambda: stack.enter_context(closing(environment(model))),
             feed,
-            plant,
             int(ahead / plant.step + 1e-9),
         )
         live = Live([env, *copies.envs], plant)
         client = protocol_of(plant).PlantClient(plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
-        feed.open(plant, poller, live)
+        feed.open(poller, live)
         return Shadow(env, feed, written, copies, stack.pop_all())

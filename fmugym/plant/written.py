@@ -12,7 +12,6 @@ from fmugym.declared import TaskEnv
 from fmugym.errors import shown
 from fmugym.logs import Actions, declared_as
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant
 from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
 
@@ -25,15 +24,14 @@ class Written:
     Args:
         env: The environment. Its hook ``_get_inputs`` becomes one that reads the plant, and so do
             the inputs of its warm-up.
-        feed: Has what acts.
-        plant: Has the tags.
+        feed: Has what acts, and the tags.
 
     Raises:
         ConfigError: If an action has no tag.
     """
 
-    def __init__(self, env: TaskEnv, feed: Feed, plant: Plant) -> None:
-        self._feed, self._plant = feed, plant
+    def __init__(self, env: TaskEnv, feed: Feed) -> None:
+        self._feed, plant = feed, feed.plant
         self._inputs = {one.name: one for one in env.inside.spec.inputs}
         for alias in env.task.root.child("agent").child("actions").value or ():
             if variable := self._inputs.get(declared_as(env, alias)[0]):
@@ -74,6 +72,6 @@ class Written:
 
     def _range_of(self, variable: Variable) -> float:
         """How far apart the values of an input are; refuses one that no tag tells."""
-        self._plant.require(variable)
+        self._feed.plant.require(variable)
         width = variable.maximum - variable.minimum
         return width if math.isfinite(width) and width > 0 else 1.0
