@@ -96,15 +96,19 @@ class Simulator:
         self.outputs, logged = common_names(trajectories)
         step = step or median_interval(trajectories)
         self._grids = [_Grid(trajectory, step) for trajectory in trajectories]
-        self._free, self._advance = free, experiment.advance
-        self._start_rows = [k for k, v in enumerate(self._free) if v.causality != "input"]
-        offsets = [v.name for v in self._free if v.causality == "input"]
+        self._advance = experiment.advance
+        self._is_offset = np.array([one.causality == "input" for one in free], np.bool_)
+        offsets = [one.name for one in free if one.causality == "input"]
         self._inputs = list(dict.fromkeys([*logged, *offsets]))
+        self._offset_rows = [self._inputs.index(name) for name in offsets]
         self._logged = self._logged_inputs(trajectories)
         constants = [start_variable(fmu.description, name, fixed[name]) for name in fixed]
-        self._variables = tuple([self._free[k] for k in self._start_rows] + constants)
-        self._constants = [_constant(v, fixed[v.name]) for v in constants]
-        spec = PoolSpec(_inputs(fmu, self._inputs), _outputs(fmu, self.outputs), step)
+        self._variables = *(one for one in free if one.causality != "input"), *constants
+        numbers = [_constant(one, fixed[one.name]) for one in constants]
+        self._constants = np.reshape(numbers, (-1, 1))
+        inputs, outputs = (tuple(map(fmu.variable, n)) for n in (self._inputs, self.outputs))
+        _require_fit(inputs, outputs)
+        spec = PoolSpec(inputs, outputs, step)
         count = num_sets * len(trajectories)
         if plant is None:
             self._pool = make_pool(fmu, spec, count, logger, backend=experiment.backend)
@@ -158,14 +162,10 @@ class Simulator:
 
     def _arrange(self, values: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
         """Split the values into start values and offsets of inputs, a column for each instance."""
-        starts = np.zeros((len(self._variables), size))
-        starts[len(self._start_rows) :] = np.reshape(self._constants, (-1, 1))
-        starts[: len(self._start_rows), : values.shape[1]] = values[self._start_rows]
+        values = np.pad(values, ((0, 0), (0, size - values.shape[1])))
         offsets = np.zeros((len(self._inputs), size))
-        for variable, row in zip(self._free, values, strict=True):
-            if variable.causality == "input":
-                offsets[self._inputs.index(variable.name), : len(row)] = row
-        return starts, offsets
+        offsets[self._offset_rows] = values[self._is_offset]
+        return np.vstack([values[~self._is_offset], np.tile(self._constants, (1, size))]), offsets
 
     def _logged_inputs(self, trajectories: Sequence[Trajectory]) -> FloatArray:
         """Return the inputs at each step, shape (steps, inputs, trajectories)."""
@@ -259,15 +259,11 @@ def _constant(variable: Variable, value: float | str) -> float:
     return checked_value(variable, value)
 
 
-def _inputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:
-    for name in names:
-        if fmu.variable(name).causality != "input":
-            raise ConfigError(f"{name!r} was logged as an input, but is not an input of the FMU")
-    return tuple(map(fmu.variable, names))
-
-
-def _outputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:
-    for name in names:
-        if not fmu.variable(name).numeric:
-            raise ConfigError(f"{name!r} cannot be compared with a measurement: it is not numeric")
-    return tuple(map(fmu.variable, names))
+def _require_fit(inputs: Sequence[Variable], outputs: Sequence[Variable]) -> None:
+    for one in inputs:
+        if one.causality != "input":
+            raise ConfigError(f"{one.name!r} was logged as an input, but is no input of the FMU")
+    for one in outputs:
+        if not one.numeric:
+            text = "cannot be compared with a measurement: it is not numeric"
+            raise ConfigError(f"{one.name!r} {text}")
