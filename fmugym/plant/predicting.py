@@ -95,9 +95,10 @@ class Predictions:
         """
         if not self.envs:
             return {}
-        pairs = zip(self.envs, self._written, strict=True)
-        if any(self._has_failed(env, written) for env, written in pairs):
-            return self.begin()
+        for env, written in zip(self.envs, self._written, strict=True):
+            *_, terminated, truncated, _ = env.step(written.action())
+            if terminated or truncated:  # the FMU has failed
+                return self.begin()
         is_new = np.array([name not in self._feed.faults for name in self.names])
         measured, seen = self._measured(), self._seen()
         found = [seen[best] + offsets for best, offsets in reversed(self._told)]
@@ -108,12 +109,6 @@ class Predictions:
         self._observer.correct(measured - seen, is_new)
         self._tell()
         return dict(zip(self.names, found[0].tolist(), strict=True))
-
-    @staticmethod
-    def _has_failed(env: TaskEnv, written: Written) -> bool:
-        """Let a copy go on by a step, and tell whether its FMU has failed."""
-        *_, terminated, truncated, _ = env.step(written.action())
-        return bool(terminated or truncated)
 
     def errors(self) -> list[Error]:
         """The errors until now, by variable and horizon."""

@@ -114,18 +114,13 @@ class _Twin:
         return Summary(self.seed, self._steps, seconds, self._reward, self._cost, "stopped")
 
     @property
-    def _passed(self) -> float:
+    def passed(self) -> float:
         """How many steps have passed, with a part of one."""
         return min((self.clock.time() - self._begin) / self.plant.step, self.most)
 
-    @property
-    def is_over(self) -> bool:
-        """Whether it has done its steps."""
-        return self._passed >= self.most
-
     def values(self) -> dict[str, tuple[float, ...]]:
         """What all tags have now."""
-        passed = self._passed
+        passed = self.passed
         while self._steps <= passed and self._steps < self.most:
             self._advance()
         part = passed - (self._steps - 1)
@@ -213,7 +208,7 @@ class Server:
                 is_over = False
                 while not is_over:
                     await asyncio.sleep(pause)
-                    is_over = twin.is_over
+                    is_over = twin.passed >= most
                     twin.values()
 
     def _raise(self) -> None:
