@@ -28,7 +28,7 @@ from fmugym.identification.statistics import (
     newey_west,
     sandwich,
 )
-from fmugym.identification.trajectory import Trajectory
+from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.starting import start_variable
 
@@ -115,7 +115,9 @@ class Problem:
         trajectories: Sequence[Trajectory],
         fit_states: bool = True,
     ) -> None:
-        self.trajectories = experiment.clean(trajectories)
+        outputs, _ = common_names(trajectories)
+        repeats = not experiment.drop_repeats
+        self.trajectories = tuple(t if repeats else t.without_repeats() for t in trajectories)
         self._state_names = list(experiment.initial_states)
         self._states = _measured_states(experiment.initial_states, self.trajectories)
         self._counted = [_counted(t, experiment) for t in self.trajectories]
@@ -123,7 +125,6 @@ class Problem:
         self._rows = range(len(names) if fit_states else len(parameters))
         variables = [_settable(experiment, name) for name in names]
         self._set_limits(variables, parameters)
-        outputs = list(self.trajectories[0].outputs)
         self._scales = _scales(experiment.scales, self.trajectories, outputs)
         self._given = [name in experiment.scales for name in outputs]
         self._last = np.empty(0), self._states

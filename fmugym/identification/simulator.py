@@ -56,11 +56,6 @@ class Experiment:
     plant: PoolOpening | None = None
     advance: Callable[[float], None] = silent
 
-    def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
-        """Check the trajectories, and drop stale samples if requested."""
-        common_names(trajectories)
-        return tuple(t.without_repeats() if self.drop_repeats else t for t in trajectories)
-
 
 class Simulator:
     """One pool with an instance for each trajectory and each set of values.
