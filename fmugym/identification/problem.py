@@ -10,8 +10,7 @@ number of trajectories.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -55,8 +54,7 @@ LEAST_NOISE = 1e-6
 """Of an output, as a part of its standard deviation."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Block:
+class _Block(NamedTuple):
     """One trajectory's part of the problem at one point.
 
     Attributes:
