@@ -81,8 +81,8 @@ class Feed:
 
     def held(self) -> list[str]:
         """The names of the FMU's variables whose last values go on."""
-        tags = [self.plant.tags.get(name) for name in self.faults]
-        return [tag.variable.name for tag in tags if tag and tag.variable]
+        tags = self.plant.tags.values()
+        return [tag.variable.name for tag in tags if tag.variable and tag.name in self.faults]
 
     def told(self) -> str:
         """What is wrong, in words; tags of which the same is wrong stand together."""

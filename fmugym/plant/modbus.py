@@ -115,7 +115,6 @@ class PlantClient:
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
         self._blocks = _neighbours(_places(plant))
-        self._client: Any
 
     @asynccontextmanager
     async def connected(self) -> AsyncIterator[None]:
@@ -198,19 +197,19 @@ async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
         await server.shutdown()
 
 
-class _Registers:
+class _Registers(NamedTuple):
     """Where a server finds registers and bits: it makes them of the values of now."""
 
-    def __init__(self, places: Sequence[_Place], values: Values) -> None:
-        self._places, self._values = places, values
+    places: Sequence[_Place]
+    values: Values
 
     # The library gives these methods their names.
 
     async def async_getValues(self, unit_id: int, code: int, begin: int, count: int) -> Any:  # noqa: N802
         """The cells from some place on; those between tags are 0."""
         found: dict[int, int] = {}
-        now = self._values()
-        for one in self._places:
+        now = self.values()
+        for one in self.places:
             if (one.unit_id, _KINDS[one.kind][0]) == (unit_id, code):
                 cells = _cells(one, now[one.tag.name])
                 found |= zip(range(one.begin, one.end), cells, strict=True)
