@@ -131,6 +131,7 @@ SLOW_TESTS = (
     "test_plant.py::TestFaults",
     "test_plant.py::TestPredictions",
     "test_plant.py::TestData::test_a_file",
+    "test_plant.py::TestData::test_has_a_past",
     "test_plant.py::TestData::test_is_what",
     "test_proposal.py::test_bundled",
     "test_proposal.py::test_foreign",

@@ -428,6 +428,17 @@ class TestData:
         (recording,) = play_log(log, lambda **more: fmugym.load(task, physical=True, **more))
         assert abs(recording.rewards.sum() - env.series["reward"][1:].sum()) > 0.01
 
+    def test_has_a_past(self, shadowed):
+        seen = {"observations": ["T", "T_out"], "history": {"of": ["T_out"], "length": "30min"}}
+        env = shadowed(house(agent=seen, data={"T_out": {"register": 200, "unit": "K"}}))
+        for _ in range(2):
+            rows = [env.reset(seed=0)[0]]
+            rows += [env.step(np.float32([0.3]))[0] for _ in range(4)]
+            now, before, earlier = np.array(rows).T[1:]
+            assert len(set(now.tolist())) > 2
+            np.testing.assert_allclose(before[1:], now[:-1], atol=1e-4)
+            np.testing.assert_allclose(earlier[2:], now[:-2], atol=1e-4)
+
     def test_a_file_that_is_not_refreshed(self, shadowed, prices):
         task = self.task(prices)
         prices[1](5)
