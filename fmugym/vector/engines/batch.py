@@ -124,8 +124,7 @@ class BatchEngine(Engine):
         self.way = "compiled" if task.is_compiled else "array"
         memory.parameters = self._parameters
         memory.hold(task)
-        layout = Layout(task, env, self._n)
-        self._new_arrays, self._divided = layout.new_arrays, layout.divided
+        self._layout = layout = Layout(task, env, self._n)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         drawn_array = (len(drawn), self._n), real
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, drawn_array
@@ -561,17 +560,14 @@ class BatchEngine(Engine):
         """See ``Engine.roll_out``."""
         if self._left or not self._pool.rolls_out:
             return None
-        horizon = len(actions)
-        shape = horizon, self._n
+        shape = len(actions), self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
-        seen = self._new_arrays(horizon)
+        arrays, observations, infos = self._layout.of_steps(len(actions))
         self.has_moved = True
-        arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
         offsets = np.empty(0) if self.offsets is None else self.offsets
         if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
             return None
-        observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
-        return observations, *judged, costs_in(infos, judged[0].shape)
+        return observations, *judged, costs_in(infos, shape)
 
     # Hooks without a program.
 
