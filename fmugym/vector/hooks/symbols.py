@@ -8,8 +8,7 @@ fits nothing, so that code that does not ask these methods fails instead of read
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -32,7 +31,6 @@ __all__ = [
     "same_cells",
     "same_for_all",
     "spread",
-    "writeable",
 ]
 
 LANES: Final = 5
@@ -84,7 +82,7 @@ class Symbols(np.ndarray[Any, Any]):
 
     _cells: npt.NDArray[Any] | None
     _graph: Graph
-    _writeable: bool
+    writeable: bool
 
     def __new__(
         cls, graph: Graph, cells: npt.NDArray[Any], dtype: npt.DTypeLike, writeable: bool = True
@@ -93,7 +91,7 @@ class Symbols(np.ndarray[Any, Any]):
         if cells.size > _MOST_ELEMENTS:
             raise UntraceableError("it computes with a large array")
         symbols: Symbols = super().__new__(cls, (0, NOWHERE), dtype)
-        symbols._graph, symbols._cells, symbols._writeable = graph, cells, writeable
+        symbols._graph, symbols._cells, symbols.writeable = graph, cells, writeable
         return symbols
 
     def __array_finalize__(self, parent: Any) -> None:
@@ -103,7 +101,7 @@ class Symbols(np.ndarray[Any, Any]):
             return
         if _memory_shape(self) != (0, NOWHERE):
             return
-        self._graph, self._writeable = parent._graph, True
+        self._graph, self.writeable = parent._graph, True
         self._cells = each(lambda cell: self._graph.cast(cell, self.dtype), parent._cells)
 
     @property
@@ -129,7 +127,7 @@ class Symbols(np.ndarray[Any, Any]):
         if not isinstance(cells, np.ndarray):
             array = empty((), object)
             array[()] = cells
-        return Symbols(self._graph, array, self.dtype if dtype is None else dtype, self._writeable)
+        return Symbols(self._graph, array, self.dtype if dtype is None else dtype, self.writeable)
 
     # What numpy asks.
 
@@ -155,7 +153,7 @@ class Symbols(np.ndarray[Any, Any]):
         return handlers["index"](self, key)
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        if not self._writeable:
+        if not self.writeable:
             raise UntraceableError("it changes an array in place that it may only read")
         if not has_symbols(key):
             new = as_symbols(self._graph, value).cast(self.dtype)
@@ -363,19 +361,6 @@ def spread(
         for lane in range(LANES):
             cells[(*place, lane)] = Cell(int(nodes[place]), lane)
     return Symbols(graph, cells, dtype, writeable)
-
-
-@contextmanager
-def writeable(arrays: Iterable[Symbols]) -> Iterator[None]:
-    """Let hooks change some arrays in place inside of a ``with`` block."""
-    own = list(arrays)
-    for symbols in own:
-        symbols._writeable = True
-    try:
-        yield
-    finally:
-        for symbols in own:
-            symbols._writeable = False
 
 
 def same_cells(first: Symbols, second: Symbols) -> bool:

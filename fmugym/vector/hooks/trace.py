@@ -37,7 +37,6 @@ from fmugym.vector.hooks.symbols import (
     same_cells,
     same_for_all,
     spread,
-    writeable,
 )
 from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
@@ -190,14 +189,13 @@ class Tracer:
         tolerance = self._graph.tolerance
         self._begin(judging=True)
         stores, updated = self._trace_update()
-        done = int(self._call("_is_done", self._flag_node))
-        stopped = self._graph.load("stopped", None, np.bool_, None)
-        results = [self._or(done, stopped)]
-        self._env.done = self._whole(results[0], np.dtype(np.bool_))
-        results.append(self._or_left("_is_truncated", self._flag_node, np.False_))
-        results.append(self._or_left("_reward_policy", self._reward_node, np.float64(0.0)))
-        self._env.done = self._whole(self._only_active(results[0]), np.dtype(np.bool_))
+        done: Any = self._call("_is_done", self._flags) | self._told("stopped")
+        self._env.done = done
+        truncated = self._or_left("_is_truncated", self._flags, np.False_)
+        rewards = self._or_left("_reward_policy", self._rewards, np.float64(0.0))
+        self._env.done = done & self._told("active")  # an episode starts elsewhere
         seen, more = self._trace_seen()
+        results = [int(same_for_all(one)) for one in (done, truncated, rewards)]
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
         parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
         return TracedTask(*parts, max(tolerance, self._graph.tolerance))
@@ -235,20 +233,13 @@ class Tracer:
             raise UntraceableError(f"a result has the shape {symbols.shape}, environments last")
         return same_for_all(symbols if dtype is None else symbols.cast(dtype))
 
-    def _whole(self, node: int, dtype: np.dtype[Any]) -> Symbols:
-        return spread(self._graph, np.array(node), dtype)
+    def _row(self, value: Any, dtype: npt.DTypeLike) -> Symbols:
+        """A result that is one value for each environment."""
+        return spread(self._graph, self._nodes(value, (), dtype), dtype)
 
-    def _or(self, node: int, other: Any) -> int:
-        flag = np.dtype(np.bool_)
-        first = self._whole(node, flag).cells[0]
-        return self._graph.apply(np.logical_or, (first, other), flag).node
-
-    def _only_active(self, node: int) -> int:
-        """A flag that is false where the FMU has not stepped: an episode starts there."""
-        flag = np.dtype(np.bool_)
-        active = self._graph.load("active", None, np.bool_, None)
-        flags = self._whole(node, flag).cells[0], active
-        return self._graph.apply(np.logical_and, flags, flag).node
+    def _told(self, kind: str) -> Any:
+        """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
+        return loaded(self._graph, kind, np.array(None, object), np.bool_)
 
     # Inputs.
 
@@ -270,29 +261,9 @@ class Tracer:
             value = array if array.ndim >= (2 if len(variables) == 1 else 1) else [array]
         if len(value) != len(variables):
             raise UntraceableError("the number of inputs is not that of the config")
-        nodes = [self._nodes(row, (), np.float64) for row in value]
-        return [
-            self._of_input_type(variable, int(node))
-            for variable, node in zip(variables, nodes, strict=True)
-        ]
-
-    def _of_input_type(self, variable: Any, node: int) -> int:
-        """Round a value to its input's type, as ``to_input_types`` does.
-
-        A value that is outside of the type's range becomes NaN, which no pool steps with.
-        """
-        if variable.type in {"Real", "Float64"}:
-            return node
-        value: Any = self._whole(node, np.dtype(np.float64))
-        if variable.kind == "boolean":
-            rounded: Any = np.where(value >= 0.5, 1.0, 0.0)
-            rounded = np.where(np.isfinite(value), rounded, value)
-        elif variable.kind in {"integer", "enumeration"}:
-            rounded = to_integer(variable, value)
-        else:
-            limit = float(np.finfo(np.float32).max)
-            rounded = np.where(np.absolute(value) <= limit, value, np.nan)
-        return int(same_for_all(rounded))
+        rows = [self._row(row, np.float64) for row in value]
+        typed = map(_of_input_type, variables, rows)
+        return [int(same_for_all(row)) for row in typed]
 
     # What follows the FMU's step.
 
@@ -302,55 +273,50 @@ class Tracer:
             return [], ()
         before = dict(self._env.variables)
         old = {name: symbols.copy() for name, symbols in before.items()}
-        with writeable(before.values()):
-            self._call("_update", lambda value: None)
-        active = self._graph.load("active", None, np.bool_, None)
+        for symbols in before.values():
+            symbols.writeable = True
+        self._call("_update", lambda value: None)
         stores, updated = [], []
         for name, symbols in before.items():
-            new = self._env.variables[name]
+            new, symbols.writeable = self._env.variables[name], False
             if new is symbols and same_cells(new, old[name]):
                 continue
-            kept = self._kept_where_idle(name, new, old[name], active)
+            kept = self._kept_where_idle(name, new, old[name])
             self._env.variables[name] = kept
             updated.append(name)
             nodes = same_for_all(kept).reshape(-1)
             stores += [Store(int(n), ("variable", name, i)) for i, n in enumerate(nodes)]
         return stores, tuple(updated)
 
-    def _kept_where_idle(self, name: str, new: Any, old: Symbols, active: Any) -> Symbols:
+    def _kept_where_idle(self, name: str, new: Any, old: Symbols) -> Symbols:
         symbols = as_symbols(self._graph, new)
         if symbols.shape != old.shape:
             if symbols.size != 1:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
         self._variables[name] = type_of_variable(self._env.inside.draws, name, symbols.dtype)
-        symbols = symbols.cast(old.dtype)
-        choose = self._graph.choose
-        cells: Any = np.empty(old.shape, object)
-        for place in np.ndindex(old.shape):
-            assigned: Any = symbols.cells[place]
-            present: Any = old.cells[place]
-            cells[place] = choose(active, assigned, present)
-        return Symbols(self._graph, cells, old.dtype, writeable=False)
+        kept: Symbols = np.where(self._told("active"), symbols.cast(old.dtype), old)
+        kept.writeable = False
+        return kept
 
-    def _or_left(self, name: str, of: Callable[[Any], Any], constant: Any) -> int:
+    def _or_left(self, name: str, of: Callable[[Any], Any], constant: Any) -> Any:
         """Trace a hook. If that fails, leave it to numpy; a constant takes its place."""
         try:
-            return int(self._call(name, of))
+            return self._call(name, of)
         except UntraceableError as reason:
             self._left[name] = str(reason)
-            return self._graph.constant(constant, constant.dtype).node
+            return self._row(constant, constant.dtype)
 
-    def _flag_node(self, value: Any) -> Any:
+    def _flags(self, value: Any) -> Symbols:
         symbols = as_symbols(self._graph, value)
         if symbols.dtype != np.bool_:
             constants = [self._graph.value(cell) for cell in symbols.cells.reshape(-1)]
             if any(constant not in (0, 1) or constant is None for constant in constants):
                 raise UntraceableError("a flag is no Boolean")
-        return self._nodes(symbols, (), np.bool_)
+        return self._row(symbols, np.bool_)
 
-    def _reward_node(self, value: Any) -> Any:
-        return self._nodes(value, (), np.float64)
+    def _rewards(self, value: Any) -> Symbols:
+        return self._row(value, np.float64)
 
     def _trace_seen(self) -> tuple[list[SeenArray], list[Store]]:
         """Trace the info if there is one, and the observation unless the pool makes it."""
@@ -403,6 +369,21 @@ def _stores(parts: list[_Seen]) -> list[Store]:
         for number, (_, nodes, _) in enumerate(parts)
         for place, node in enumerate(nodes.reshape(-1))
     ]
+
+
+def _of_input_type(variable: Any, value: Any) -> Any:
+    """Round a value to its input's type, as ``to_input_types`` does.
+
+    A value that is outside of the type's range becomes NaN, which no pool steps with.
+    """
+    if variable.type in {"Real", "Float64"}:
+        return value
+    if variable.kind == "boolean":
+        return np.where(np.isfinite(value), np.where(value >= 0.5, 1.0, 0.0), value)
+    if variable.kind in {"integer", "enumeration"}:
+        return to_integer(variable, value)
+    limit = float(np.finfo(np.float32).max)
+    return np.where(np.absolute(value) <= limit, value, np.nan)
 
 
 def to_integer(variable: Any, value: Any) -> Any:
