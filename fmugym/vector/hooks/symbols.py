@@ -46,21 +46,17 @@ asarray: Final = np.asarray
 """These are quick also while hooks are traced, when others stand in their places in numpy."""
 
 _KEPT: Final = frozenset(
-    {"__array_finalize__", "__array_priority__", "__class__", "__new__", "__init__", "__dir__"}
-    | {"__doc__", "__getattribute__", "__setattr__", "__delattr__", "__hash__", "__repr__"}
-    | {"__str__", "__init_subclass__", "__subclasshook__", "__sizeof__", "__class_getitem__"}
-    | {"__format__", "__array_wrap__", "__array_interface__", "__array_struct__", "__getstate__"}
-    | {"__abs__", "__add__", "__and__", "__divmod__", "__eq__", "__floordiv__", "__ge__"}
-    | {"__gt__", "__iadd__", "__iand__", "__ifloordiv__", "__imod__", "__imul__", "__invert__"}
-    | {"__ior__", "__ipow__", "__isub__", "__itruediv__", "__ixor__", "__le__", "__lshift__"}
-    | {"__lt__", "__mod__", "__mul__", "__ne__", "__neg__", "__or__", "__pos__", "__pow__"}
-    | {"__radd__", "__rand__", "__rdivmod__", "__rfloordiv__", "__rlshift__", "__rmod__"}
-    | {"__rmul__", "__ror__", "__rpow__", "__rrshift__", "__rshift__", "__rsub__", "__rtruediv__"}
-    | {"__rxor__", "__sub__", "__truediv__", "__xor__", "__matmul__", "__rmatmul__", "dtype"}
-    | {"sum", "prod", "min", "max", "any", "all", "clip", "mean", "var", "std", "astype"}
-    | {"conj", "conjugate", "itemsize"}
+    {"sum", "prod", "min", "max", "any", "all", "clip", "mean", "var", "std", "astype"}
+    | {"conj", "conjugate", "dtype", "itemsize"}
 )
 """What of ``numpy.ndarray`` works here, because it ends in one of the three methods of numpy."""
+
+_REFUSED: Final = frozenset(
+    {"__array__", "__array_namespace__", "__array_prepare__", "__buffer__", "__contains__"}
+    | {"__delitem__", "__dlpack__", "__dlpack_device__", "__imatmul__", "__reduce__"}
+    | {"__reduce_ex__", "__setstate__"}
+)
+"""The special methods that do not; all others are Python's operators, or look at no element."""
 
 
 handlers: Final[dict[str, Callable[..., Any]]] = {}
@@ -239,9 +235,10 @@ _METHODS: Final[Mapping[str, Any]] = {
 """Methods and properties of arrays that only move elements, or that symbols have of their own."""
 
 for _name in dir(np.ndarray):
+    _works = _name not in _REFUSED if _name.startswith("__") else _name in _KEPT
     if _name in _METHODS:
         setattr(Symbols, _name, _METHODS[_name])
-    elif _name not in _KEPT and _name not in vars(Symbols):
+    elif not _works and _name not in vars(Symbols):
         is_method = callable(getattr(np.ndarray, _name))
         setattr(Symbols, _name, _refusing(_name) if is_method else property(_refusing(_name)))
 
