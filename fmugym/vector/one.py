@@ -93,31 +93,24 @@ class Player:
         task = _traced(env, self._numbers)
         draws, ended = env.inside.draws, np.ones(1, np.bool_)
         self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
-        self._starts = draws.constants[:, None].copy()
+        starts = draws.constants[:, None].copy()
         self._memory = memory = Memory(env, self._rows, ended, self._numbers)
-        memory.parameters = dict(zip(draws.parameter_names, self._starts, strict=True))
+        memory.parameters = dict(zip(draws.parameter_names, starts, strict=True))
         memory.hold(task)
         self._task = task
         reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
         self._parameters = frozenset(memory.parameters if reads else ())
-        self.readings: Any = PoolReadings(env, self._own, self._rows, memory)
-        self._prepare(env, task, memory)
-
-    def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
-        """Hand the programs and their arrays to the pool."""
-        draws, (shapes, form, divided) = env.inside.draws, Layout(task, env, 1).of_one()
+        shapes, form, divided = Layout(task, env, 1).of_one()
         self._complete = None if divided is None else partial(_complete, divided)
-        real, flags = np.dtype(np.float64), ((1,), np.dtype(np.bool_))
-        arrays = *shapes, ((1,), real), flags, flags, flags, ((0, 1), real)
-        self._pool.prepare_play(
-            draws.model_variables,
-            memory.programs(task),
-            memory.action_group(),
-            self._starts,
-            (no_draws(), np.zeros((1, 6), np.uint64)),
-            (self._rows.step_count, memory.ended, env.inside.step_limit),
-            memory.surroundings(task, (), (tuple, form, (), arrays, (None,) * 3)),
+        memory.prepare(
+            self._pool,
+            task,
+            starts,
+            (no_draws(), (), np.zeros((1, 6), np.uint64)),
+            env.inside.step_limit,
+            (tuple, form, (), shapes, (None,) * 3),
         )
+        self.readings: Any = PoolReadings(env, self._own, self._rows)
         self._watch()
 
     def _watch(self) -> None:
@@ -264,30 +257,35 @@ class PoolReadings:
     environment keeps everything itself again.
     """
 
-    def __init__(self, env: FMUEnv, own: Readings, rows: Readings, memory: Memory) -> None:
-        self._env, self._own = weakref.ref(env), own
-        self._width, self._count = env.inside.output_count, rows.step_count
-        self._outputs, self._inputs = rows.values[:, 0], rows.inputs[:, 0]
-        self._kept, self._done = memory.kept[:, 0], rows.done
-        self._current, self._previous = memory.actions
-        self.out = own.out
-
-    values = property(lambda self: tuple(self._outputs.tolist()))
-    state = property(lambda self: tuple(self._outputs[: self._width].tolist()))
-    previous_state = property(lambda self: tuple(self._kept[: self._width].tolist()))
-    inputs = property(lambda self: tuple(self._inputs.tolist()))
-    action = property(lambda self: self._current[0].copy())
-    previous_action = property(lambda self: self._previous[0].copy())
-    step_count = property(lambda self: self._count.item())
-    done = property(lambda self: self._done.item())
-    after_end = property(lambda self: self._own.after_end)
     parameters = property(lambda self: self._own.parameters)
+    after_end = property(lambda self: self._own.after_end)
+
+    def __init__(self, env: FMUEnv, own: Readings, rows: Readings) -> None:
+        self._env, self._own, self.out = weakref.ref(env), own, own.out
+        self._views = {name: getattr(rows, name)[..., 0] for name in _FROM_POOL}
 
     @property
     def variables(self) -> Any:
         env: Any = self._env()
         env.inside.keep()
         return self._own.variables
+
+
+def _read_from_pool(name: str, make: Callable[[npt.NDArray[Any]], Any]) -> property:
+    return property(lambda self: make(self._views[name]))
+
+
+_FROM_POOL: Final[Mapping[str, Callable[[npt.NDArray[Any]], Any]]] = {
+    **dict.fromkeys(
+        ("values", "state", "previous_state", "inputs"), lambda part: tuple(part.tolist())
+    ),
+    **dict.fromkeys(("action", "previous_action"), lambda part: part[()].copy()),
+    **dict.fromkeys(("step_count", "done"), lambda part: part.item()),
+}
+"""What makes a reading of the part of an array that belongs to the environment."""
+
+for _name, _make in _FROM_POOL.items():
+    setattr(PoolReadings, _name, _read_from_pool(_name, _make))
 
 
 class Watched(NamedTuple):

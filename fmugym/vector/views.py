@@ -59,11 +59,10 @@ def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> 
 def column(batch: Readings, index: int) -> Readings:
     """Return what the hooks of one environment of a batch read, as Python's numbers."""
     one = batch.mapped(lambda row: take(row, index))
-    for name in ("values", "previous_state", "inputs"):
-        setattr(one, name, tuple(getattr(one, name).tolist()))
+    for name in ("values", "previous_state", "inputs", "step_count", "done", "after_end"):
+        numbers = getattr(one, name).tolist()
+        setattr(one, name, tuple(numbers) if isinstance(numbers, list) else numbers)
     one.state = one.values[: len(batch.state)]
-    one.step_count = int(one.step_count)
-    one.done, one.after_end = bool(one.done), bool(one.after_end)
     return one
 
 

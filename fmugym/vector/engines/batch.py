@@ -116,7 +116,7 @@ class BatchEngine(Engine):
 
     def _prepare(self, task: TracedTask) -> None:
         """Give the pool everything it needs for steps."""
-        env, memory, streams = self.env, self._memory, self._streams
+        env, memory = self.env, self._memory
         draws, native = env.inside.draws, env.inside.draws.native
         drawn = () if native is None else draws.drawn
         self._task, self._left = task, task.left
@@ -125,18 +125,13 @@ class BatchEngine(Engine):
         memory.parameters = self._parameters
         memory.hold(task)
         self._layout = layout = Layout(task, env, self._n)
-        flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
-        drawn_array = (len(drawn), self._n), real
-        arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, drawn_array
-        tell = late_info(draws)
-        self._play = self._pool.prepare_play(
-            draws.model_variables,
-            memory.programs(task),
-            memory.action_group(),
+        self._play = memory.prepare(
+            self._pool,
+            task,
             self._start_values,
-            (no_draws() if native is None else native, streams.states),
-            (env.step_count, self.ended, self._limit),
-            memory.surroundings(task, drawn, (StepResult, *layout.form, arrays, tell)),
+            (no_draws() if native is None else native, drawn, self._streams.states),
+            self._limit,
+            (StepResult, *layout.form, layout.shapes, late_info(draws)),
         )
         has_all_starts = native is not None and task.variables.keys() == env.variables.keys()
         is_free = env.inside.warm_ups is None and not self._pool.retries_resets

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import MaskArray
+from fmugym.pool.base import FloatArray, MaskArray, Play, Pool
 from fmugym.task.episode import Draw
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks import hook_results
@@ -80,9 +80,41 @@ class Memory:
         self._done[:] = done
         self._readings.done = self._done
 
-    def programs(self, task: TracedTask) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        """The programs, with the arrays that they load and store."""
-        return task.inputs.with_rows(self.find), task.judgement.with_rows(self.find)
+    def prepare(
+        self,
+        pool: Pool,
+        task: TracedTask,
+        starts: FloatArray,
+        draws: tuple[Any, Sequence[Draw], npt.NDArray[np.uint64]],
+        limit: int,
+        form: tuple[Any, ...],
+    ) -> Play:
+        """Give a pool everything it needs for steps.
+
+        Args:
+            pool: Has the FMUs.
+            task: The programs; their variables are held.
+            starts: The values of each parameter, a row each.
+            draws: What draws values natively, what it draws, and the streams.
+            limit: The number of steps after which episodes are truncated.
+            form: How the pool makes results: their type, the forms of observations and infos, the
+                shapes and types of their arrays, and what makes the info of a reset.
+        """
+        native, drawn, streams = draws
+        *kinds, shapes, late = form
+        flags, real = ((self._n,), self._done.dtype), np.dtype(np.float64)
+        judged = ((self._n,), real), flags, flags, flags
+        return pool.prepare_play(
+            self._env.inside.draws.model_variables,
+            (task.inputs.with_rows(self.find), task.judgement.with_rows(self.find)),
+            self._action_group(),
+            starts,
+            (native, streams),
+            (self._readings.step_count, self.ended, limit),
+            self._surroundings(
+                task, drawn, (*kinds, (*shapes, *judged, ((len(drawn), self._n), real)), late)
+            ),
+        )
 
     def find(self, row: Row) -> Any:
         """The array of a row that a program loads or stores."""
@@ -105,7 +137,7 @@ class Memory:
         arrays = self.variables if kind == "variable" else self.before
         return arrays[name].reshape(-1, self._n)[index]
 
-    def action_group(self) -> dict[str, Any]:
+    def _action_group(self) -> dict[str, Any]:
         """How the pool checks and keeps actions."""
         env, dtype = self._env, self.actions[0].dtype
         space: Any = env.action_space
@@ -125,13 +157,15 @@ class Memory:
             "none": np.array(env.inside.no_action, dtype).reshape(-1),
         }
 
-    def surroundings(self, task: TracedTask, drawn: Sequence[Draw], results: Any) -> dict[str, Any]:
+    def _surroundings(
+        self, task: TracedTask, drawn: Sequence[Draw], results: tuple[Any, ...]
+    ) -> dict[str, Any]:
         """What the pool keeps beside the programs; see ``NativePool.prepare_play``.
 
         Args:
             task: The programs.
             drawn: What the pool draws.
-            results: How it makes results, or None.
+            results: How it makes results.
         """
         env, draws = self._env, self._env.inside.draws
         names = draws.parameter_names
