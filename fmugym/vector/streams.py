@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import row_of, state_of
@@ -31,9 +30,9 @@ class EpisodeStreams:
     """Draws the episodes of N environments from N random streams.
 
     Seeded with s, environment i draws what a single environment seeded with s + i draws, episode
-    after episode. A stream is the state of a ``numpy.random.PCG64``. Where the C extension exists,
-    it seeds the streams and draws from them; a generator of numpy takes the place of a stream
-    only for distributions that Python must draw.
+    after episode. A stream is the state of a ``numpy.random.PCG64``. The C extension
+    seeds the streams and draws from them; a generator of numpy takes the place of a stream only
+    for distributions that Python must draw.
 
     Args:
         num_envs: N.
@@ -93,14 +92,10 @@ class EpisodeStreams:
 
     def _seed_rows(self, indices: list[int], seeds: list[int], size: int) -> None:
         """Seed streams with integers of at most so many bytes."""
-        if has_native_pool():
-            from fmugym import _native
+        from fmugym import _native  # as all batches need it
 
-            words = np.frombuffer(b"".join([s.to_bytes(size, "little") for s in seeds]), "<u4")
-            _native.seed(self.states, np.array(indices), words.astype(np.uint32).tobytes())
-            return
-        for index, seed in zip(indices, seeds, strict=True):
-            self.states[index] = row_of(np.random.PCG64(seed).state)
+        words = np.frombuffer(b"".join([s.to_bytes(size, "little") for s in seeds]), "<u4")
+        _native.seed(self.states, np.array(indices), words.astype(np.uint32).tobytes())
 
     def draw(self, draws: EpisodeDraws, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
