@@ -286,24 +286,25 @@ def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
     return result
 
 
-def _filled(value: Any) -> Callable[..., Symbols]:
-    def make(
-        a: Symbols, dtype: Any = None, order: Any = "K", subok: Any = True, shape: Any = None
-    ) -> Any:
-        wanted = a.dtype if dtype is None else np.dtype(dtype)
-        return lift(a.graph, np.full(a.shape if shape is None else shape, value, wanted))
-
-    return make
-
-
-def full_like(a: Any, fill_value: Any, dtype: Any = None, **_: Any) -> Symbols:
+def full_like(
+    a: Any,
+    fill_value: Any,
+    dtype: Any = None,
+    order: Any = "K",
+    subok: Any = True,
+    shape: Any = None,
+) -> Symbols:
     """Do what ``numpy.full_like`` does."""
     graph = graph_of(a, fill_value)
     like = as_symbols(graph, a)
     wanted = like.dtype if dtype is None else np.dtype(dtype)
-    result = lift(graph, np.zeros(like.shape, wanted))
+    result = lift(graph, np.zeros(like.shape if shape is None else shape, wanted))
     result[...] = fill_value
     return result
+
+
+def _filled(value: Any) -> Callable[..., Symbols]:
+    return lambda a, *args, **keywords: full_like(a, value, *args, **keywords)
 
 
 def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:  # noqa: A002  (numpy's)
