@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.base import FloatArray
 from fmugym.signals import ordinary
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import ORDER
@@ -154,7 +154,8 @@ def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
     """Run short episodes with small inputs; a slow FMU would take long for more."""
     pool, draws = env.inside.pool, env.inside.draws
     if pool.is_real:
-        return _imagine_states(pool, rng)
+        zeros = np.zeros(len(pool.outputs)), np.zeros(len(pool.inputs))
+        return _drawn_around(*zeros, [1.0] * _EPISODES * _STEPS, rng)  # nothing real must move
     mask = np.zeros(pool.num_instances, np.bool_)
     mask[0] = True
     visited: list[Visited] = []
@@ -177,22 +178,19 @@ def states_around(env: FMUEnv, reaches: Sequence[float]) -> list[Visited]:
         env: The environment.
         reaches: How far each is from there, relative to the magnitudes of the values.
     """
-    rng, now = np.random.default_rng(0), env.inside.readings
-    centres = [np.array(values, np.float64) for values in (now.values, now.values, now.inputs)]
+    now = env.inside.readings
+    values, inputs = (np.array(part, np.float64) for part in (now.values, now.inputs))
+    return _drawn_around(values, inputs, reaches, np.random.default_rng(0))
 
+
+def _drawn_around(
+    values: FloatArray, inputs: FloatArray, reaches: Sequence[float], rng: np.random.Generator
+) -> list[Visited]:
     def moved(reach: float) -> Any:
+        centres = values, values, inputs
         return tuple(c + reach * (1 + abs(c)) * rng.normal(size=len(c)) for c in centres)
 
     return [moved(reach) for reach in reaches]
-
-
-def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[Visited]:
-    """Draw states: the check must not move anything real."""
-    sizes = (len(pool.outputs), len(pool.outputs), len(pool.inputs))
-    return [
-        (rng.normal(size=sizes[0]), rng.normal(size=sizes[1]), rng.normal(size=sizes[2]))
-        for _ in range(_EPISODES * _STEPS)
-    ]
 
 
 def _place_sample(
