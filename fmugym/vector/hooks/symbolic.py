@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
-from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues, ParameterValues
+from fmugym.task.values import NamedTexts, ParameterValues
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import LANES, Symbols, lift, loaded
+from fmugym.vector.views import batched
 
-__all__ = ["SymbolicParameters", "element_names", "symbolic_outputs", "symbolic_readings"]
+__all__ = ["element_names", "symbolic_readings"]
 
 
 def symbolic_readings(
@@ -34,41 +35,25 @@ def symbolic_readings(
     def rows(shape: tuple[int, ...], *head: Any, dtype: Any = np.float64) -> Any:
         return loaded(graph, "row", element_names(shape, *head), dtype)
 
-    values = rows((len(env.out),), "output")
-    state = values[: env.inside.output_count]
-    names = EpisodeVariables(env.config.episode_variables)
+    values, strings = rows((len(env.out),), "output"), env.fmu.description.strings
+    read = batched(env, LANES, values, rows((len(env.inside.interface.inputs),), "input"))
+    read.out = _SymbolicOutputs(list(env.out), strings.intersection(env.out), lambda: values)
+    kept = rows((len(env.out),), "kept") if judging else values
+    read.previous_state = kept[: env.inside.output_count]
+    for name in ("action", "previous_action"):
+        setattr(read, name, _symbolic_action(env, graph, name))
+    read.step_count = rows((), "step_count", dtype=np.int64)
+    missing = np.array("it reads self.done before there is one", object)
+    read.done = loaded(graph, "missing", missing, np.bool_)
+    read.after_end = lift(graph, read.after_end)
+    known = dict.fromkeys((*env.inside.interface.parameters, *env.parameters))
+    symbols = {name: rows((), "parameter", name) for name in known}
+    read.parameters = MappingProxyType(_SymbolicParameters(symbols, strings))
     for name, dtype in variables.items():
         shape = np.shape(env.config.episode_variables[name])
-        names[name] = rows(shape, "before" if judging else "variable", name, dtype=dtype)
-    missing = np.array("it reads self.done before there is one", object)
-    known = dict.fromkeys((*env.inside.interface.parameters, *env.parameters))
-    return Readings(
-        values=values,
-        out=symbolic_outputs(env, values),
-        state=state,
-        previous_state=rows((len(env.out),), "kept")[: env.inside.output_count]
-        if judging
-        else state,
-        inputs=rows((len(env.inside.interface.inputs),), "input"),
-        action=_symbolic_action(env, graph, "action"),
-        previous_action=_symbolic_action(env, graph, "previous_action"),
-        step_count=rows((), "step_count", dtype=np.int64),
-        done=loaded(graph, "missing", missing, np.bool_),
-        after_end=lift(graph, np.zeros(LANES, np.bool_)),
-        parameters=MappingProxyType(
-            SymbolicParameters(
-                {n: rows((), "parameter", n) for n in known},
-                env.fmu.description.strings,
-            )
-        ),
-        variables=names,
-    )
-
-
-def symbolic_outputs(env: FMUEnv, values: Any) -> NamedValues:
-    """Symbols by the names of outputs; Strings have none."""
-    strings = env.fmu.description.strings.intersection(env.out)
-    return _SymbolicOutputs(list(env.out), strings, lambda: values)
+        head = "before" if judging else "variable", name
+        read.variables[name] = rows(shape, *head, dtype=dtype)
+    return read
 
 
 class _SymbolicOutputs(NamedTexts):
@@ -78,7 +63,7 @@ class _SymbolicOutputs(NamedTexts):
         raise UntraceableError(f"it reads the String {name!r}")
 
 
-class SymbolicParameters(ParameterValues):
+class _SymbolicParameters(ParameterValues):
     """The symbols of parameters; Strings have none, and hooks that read one cannot be traced.
 
     Args:
