@@ -16,7 +16,7 @@ from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.contents import Contents
 
-__all__ = ["TOGETHER", "MethodCall", "attribute", "checked_name", "require_settable"]
+__all__ = ["TOGETHER", "MethodCalls", "attribute", "checked_name", "require_settable"]
 
 TOGETHER: Final = frozenset({"close", "reset", "step"})
 """Methods that one environment cannot do alone."""
@@ -71,28 +71,32 @@ def _require_unchanged(before: Readings, after: Readings) -> None:
             require_settable(name)
 
 
-class MethodCall:
-    """What a method of one environment of a batch has assigned.
+class MethodCalls:
+    """What a method has assigned, which is called for some environments of a batch.
 
     Attributes:
-        index: The number of the environment.
-        attributes: The attributes that the method has assigned, by name.
-        variables: The episode variables that it has assigned, by name.
+        attributes: The attributes: by name, values by the number of the environment.
+        variables: The episode variables likewise.
     """
 
-    def __init__(self, index: int) -> None:
-        self.index = index
-        self.attributes: dict[str, Any] = {}
-        self.variables: dict[str, Any] = {}
+    def __init__(self) -> None:
+        self.attributes: dict[str, dict[int, Any]] = {}
+        self.variables: dict[str, dict[int, Any]] = {}
 
     def run(
-        self, env: FMUEnv, name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]
+        self,
+        env: FMUEnv,
+        index: int,
+        name: str,
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
     ) -> Any:
         """Call the method, or return the attribute if it is none.
 
         Args:
             env: The prototype, which reads the values of this environment. Afterwards it is as
                 before, also in the objects that it holds.
+            index: The number of this environment.
             name: The name of the method.
             arguments: The arguments of the method by position.
             keywords: Those by name.
@@ -107,19 +111,25 @@ class MethodCall:
             value = attribute(env, name)
             returned = value(*arguments, **keywords) if callable(value) else value
             _require_unchanged(readings, Readings.of(env))
-            self._note_attributes(before, vars(env), contents.changed_in_place())
-            self.variables = {n: v for n, v in env.variables.items() if variables[n] is not v}
+            self._note_attributes(index, before, vars(env), contents.changed_in_place())
+            for variable, number in env.variables.items():
+                if variables[variable] is not number:
+                    self.variables.setdefault(variable, {})[index] = number
         finally:
             contents.restore()
         return returned
 
     def _note_attributes(
-        self, before: Mapping[str, Any], after: Mapping[str, Any], in_place: Collection[str]
+        self,
+        index: int,
+        before: Mapping[str, Any],
+        after: Mapping[str, Any],
+        in_place: Collection[str],
     ) -> None:
         for name, value in after.items():
             if name not in before or value is not before[name]:
                 require_settable(name)
-                self.attributes[name] = value
+                self.attributes.setdefault(name, {})[index] = value
             elif name in in_place:
                 raise ConfigError(
                     f"a method changes self.{name} in place, which all environments share: let it "

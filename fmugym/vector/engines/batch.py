@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -18,7 +18,7 @@ from fmugym.archive.texts import numbers_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE
-from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
+from fmugym.pool.base import FloatArray, MaskArray, Played
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
@@ -36,7 +36,7 @@ from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import checked_actions
-from fmugym.vector.calls import MethodCall, attribute
+from fmugym.vector.calls import MethodCalls, attribute
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult, failed_in
@@ -234,18 +234,12 @@ class BatchEngine(Engine):
         keywords: Mapping[str, Any],
     ) -> list[Any]:
         """See ``Engine.call``."""
-        calls, returned = [MethodCall(index) for index in indices], []
-        for call in calls:
-            with self.single(call.index) as env:
-                returned.append(call.run(env, name, arguments, keywords))
-        attributes = {
-            attribute_name: self._of_all(attribute_name, values)
-            for attribute_name, values in _by_name(calls, lambda call: call.attributes).items()
-        }
-        variables = {
-            variable: self._with(variable, values)
-            for variable, values in _by_name(calls, lambda call: call.variables).items()
-        }
+        calls, returned = MethodCalls(), []
+        for index in indices:
+            with self.single(index) as env:
+                returned.append(calls.run(env, index, name, arguments, keywords))
+        attributes = {n: self._of_all(n, values) for n, values in calls.attributes.items()}
+        variables = {n: self._with(n, values) for n, values in calls.variables.items()}
         if attributes:
             self._assign(attributes)
         for variable, row in variables.items():
@@ -573,27 +567,25 @@ class BatchEngine(Engine):
         read.previous_action, read.action = read.action, environments_last(actions)
         read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
-            self._write_inputs(env._get_inputs(), resetting)
+            self._write_inputs(self._pool.inputs, resetting)
         finally:
             env.inside.in_hooks = False
             read.action, read.previous_action, read.previous_state = before
 
-    def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
-        inputs = self._pool.inputs
-        hook_results.write_inputs(values, inputs)
+    def _write_inputs(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
+        hook_results.write_inputs(self.env._get_inputs(), inputs)
         if not self.env.inside.input_writer.all_real:
             for index in self._stepping(resetting):
                 inputs[:, index] = fmu_spaces.to_input_types(
                     self.env.inside.interface.inputs, inputs[:, index]
                 )
-        self._require_finite_inputs(resetting)
+        self._require_finite(inputs, resetting)
 
     def _stepping(self, resetting: MaskArray | None) -> list[int]:
         """The indices of the environments that do not start an episode in this step."""
         return [i for i in range(self._n) if resetting is None or not resetting[i]]
 
-    def _require_finite_inputs(self, resetting: MaskArray | None) -> None:
-        inputs = self._pool.inputs
+    def _require_finite(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
         finite = np.isfinite(inputs)
         if np.count_nonzero(finite) == finite.size:  # a third of the time of all()
             return
@@ -716,7 +708,7 @@ class BatchEngine(Engine):
         self._require_possible_inputs(started)
         self.env.inside.in_hooks = True
         try:
-            self._handle_faults(result, self._pool.statuses, wrong)
+            self._handle_faults(result, wrong)
         finally:
             self.env.inside.in_hooks = False
         self.note_ends(result.terminated, result.truncated)
@@ -727,19 +719,16 @@ class BatchEngine(Engine):
         """Refuse inputs that are not finite, which they also are outside of their type's range."""
         inputs = self._pool.inputs
         if not self.env.inside.input_writer.all_real and not np.isfinite(inputs).all():
-            wanted = np.array(inputs)
-            hook_results.write_inputs(self.env._get_inputs(), wanted)
-            for index in self._stepping(resetting):
-                fmu_spaces.to_input_types(self.env.inside.interface.inputs, wanted[:, index])
-        self._require_finite_inputs(resetting)
+            self._write_inputs(np.array(inputs), resetting)
+        self._require_finite(inputs, resetting)
 
     def _handle_faults(
         self,
         result: StepResult,
-        statuses: StatusArray,
         wrong: tuple[MaskArray | None, MaskArray | None],
     ) -> None:
         """Handle FMUs that failed or asked to stop, and numbers that are not finite."""
+        statuses = self._pool.statuses
         stopped, failed = statuses == TERMINATED_CODE, failed_in(statuses)
         if stopped.any():
             result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
@@ -853,17 +842,6 @@ def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
 def _set_all(env: FMUEnv, attributes: Mapping[str, Any]) -> None:
     for name, value in attributes.items():
         setattr(env, name, value)
-
-
-def _by_name(
-    calls: Iterable[MethodCall], assigned: Callable[[MethodCall], Mapping[str, Any]]
-) -> dict[str, dict[int, Any]]:
-    """The values that methods have assigned: for each name, values by environment index."""
-    by_name: dict[str, dict[int, Any]] = {}
-    for call in calls:
-        for name, value in assigned(call).items():
-            by_name.setdefault(name, {})[call.index] = value
-    return by_name
 
 
 def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
