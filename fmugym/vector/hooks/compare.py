@@ -134,20 +134,19 @@ class _Comparison:
         return np.broadcast_to(value, self._before[name].shape).reshape(-1, self._count)
 
     def _compare_seen(self, seen: tuple[npt.NDArray[Any], ...]) -> None:
-        env, count = self._env, self._count
-        tree: dict[str, Any] = {}
-        if any(array.path[0] == "observation" for array in self._task.seen):
-            observation = env._get_observation()
-            tree["observation"] = hook_results.observations(
-                observation, env.observation_space, count
-            )
-        if any(array.path[0] == "info" for array in self._task.seen):
-            tree["info"] = hook_results.info_arrays(env._get_info(), np.ones(count, np.bool_))
+        env, tree = self._env, dict[str, Any]()
+        for kind in dict.fromkeys(array.path[0] for array in self._task.seen):
+            value = getattr(env, f"_get_{kind}")()
+            if kind == "observation":
+                value = hook_results.observations(value, env.observation_space, self._count)
+            else:
+                value = hook_results.info_arrays(value, np.ones(self._count, np.bool_))
+            tree[kind] = value
         for array, description in zip(seen, self._task.seen, strict=True):
             expected: Any = tree
             for name in description.path:
                 expected = expected[name]
-            hook = "_get_observation" if description.path[0] == "observation" else "_get_info"
+            hook = f"_get_{description.path[0]}"
             self._require_equal(hook, array, expected)
             if array.dtype != expected.dtype:
                 raise UntraceableError(f"the program of {hook} gives another type")
