@@ -265,9 +265,10 @@ class MPC(Controller):
             options |= {"model_parameters": given} if given else {}
             observations, _ = copied.reset(seed=self.seed, options=options)
         keys = () if env.inside.future is None else env.inside.future.keys
-        for name, value in env.variables.items():
-            if np.ndim(value) == 0 and name not in keys and name in self._prototype.variables:
-                copied.inside.engine.set_variable(name, float(value))
+        known = self._prototype.variables.keys() - keys
+        copied.inside.engine.show(
+            {n: float(v) for n, v in env.variables.items() if np.ndim(v) == 0 and n in known}, {}
+        )
         episode.seen = np.asarray(observations, np.float64)
         episode.snapshot = copied.save_state()
         episode.plan = np.full(self._plan_shape, 0.5)

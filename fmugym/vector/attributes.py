@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
+from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.signals import ordinary
 from fmugym.task.construction import draws_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.calls import TOGETHER, checked_name, require_settable
+from fmugym.vector.calls import TOGETHER, require_settable
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
 
 __all__ = ["Attributes"]
+
+_NAME: Final = "the name of an attribute"
 
 
 class Attributes:
@@ -38,14 +41,14 @@ class Attributes:
         Raises:
             ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
         """
-        name = checked_name(name)
+        name = check_text(_NAME, name)
         return [self._engine.read(name, index) for index in indices]
 
     def call(
         self, name: str, indices: Sequence[int], args: Sequence[Any], kwargs: Mapping[str, Any]
     ) -> list[Any]:
         """Call a method of some environments; see ``FMUVectorEnv.call``."""
-        name = checked_name(name)
+        name = check_text(_NAME, name)
         if name in TOGETHER:
             raise ConfigError(f"{name!r} cannot be called on single environments of many")
         if name == "render":
@@ -72,7 +75,7 @@ class Attributes:
 
     def set(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter, of all environments; see ``FMUVectorEnv.set_attr``."""
-        name = checked_name(name)
+        name = check_text(_NAME, name)
         each = self._each(name, values)
         if self.is_parameter(name):
             self._set_parameter(name, each)

@@ -10,13 +10,13 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.contents import Contents
 
-__all__ = ["TOGETHER", "MethodCalls", "attribute", "checked_name", "require_settable"]
+__all__ = ["TOGETHER", "MethodCalls", "attribute", "require_settable"]
 
 TOGETHER: Final = frozenset({"close", "reset", "step"})
 """Methods that one environment cannot do alone."""
@@ -39,24 +39,12 @@ def require_settable(name: str) -> None:
         raise ConfigError(f"{name!r} cannot be set: every environment keeps it itself")
 
 
-def checked_name(name: Any) -> str:
-    """Return the name of an attribute as plain text.
-
-    Raises:
-        ConfigError: If it is no text.
-    """
-    if not isinstance(name, str):
-        raise ConfigError(f"the name of an attribute must be text, got {shown(name)}")
-    return str.__str__(name)  # a subclass may have odd methods
-
-
-def attribute(env: FMUEnv, name: Any) -> Any:
+def attribute(env: FMUEnv, name: str) -> Any:
     """Return an attribute of an environment, or else a parameter of its episode.
 
     Raises:
         ConfigError: If there is none of this name (it is an ``AttributeError``, too).
     """
-    name = checked_name(name)
     if not hasattr(env, name) and name in env.parameters:
         return env.parameters[name]
     try:

@@ -163,6 +163,4 @@ class Episodes:
         if values:
             variables = tuple(map(self._prototype.fmu.variable, values))
             self._pool.write(variables, np.stack(list(values.values())))
-            self._engine.show_parameters(values)
-        for name, value in candidates.variables.items():
-            self._engine.set_variable(name, value)
+        self._engine.show(candidates.variables, values)

@@ -215,7 +215,7 @@ def test_methods_that_no_environment_can_do_alone(hooks, make_envs):
             vector.call(method)
     assert vector.call("render") == (None, None)
     for odd in (3, None, ["x"], np.ones(2)):
-        with pytest.raises(ConfigError, match="the name of an attribute must be text"):
+        with pytest.raises(ConfigError, match="the name of an attribute must be a text"):
             vector.get_attr(odd)
 
 

@@ -36,7 +36,7 @@ from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import checked_actions
-from fmugym.vector.calls import MethodCalls, attribute
+from fmugym.vector.calls import MethodCalls
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult, failed_in
@@ -183,8 +183,7 @@ class BatchEngine(Engine):
 
     def read(self, name: str, index: int) -> Any:
         """See ``Engine.read``; a method that is called later reads the values of that moment."""
-        with self.single(index) as env:
-            value = attribute(env, name)
+        value = super().read(name, index)
         if isinstance(value, MethodType) and value.__self__ is self.env:
             return partial(self._call_one, name, index)
         return value
@@ -360,7 +359,7 @@ class BatchEngine(Engine):
         self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
         self._note_foreign(indices, draws is not self.env.inside.draws)
 
-    def _place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
+    def _place(self, values: Mapping[str, Any], indices: IndexArray | slice) -> None:
         for name, value in values.items():
             self._row(name)[..., indices] = value
 
@@ -430,15 +429,11 @@ class BatchEngine(Engine):
             if tables:
                 self._prepare(own)
 
-    def set_variable(self, name: str, value: float) -> None:
-        """See ``Engine.set_variable``."""
-        self._row(name)[:] = value
-
-    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
-        """See ``Engine.show_parameters``."""
-        for name, numbers in values.items():
-            self._row(name)[:] = numbers
-        self._note_foreign(slice(None), True)
+    def show(self, variables: Mapping[str, float], parameters: Mapping[str, FloatArray]) -> None:
+        """See ``Engine.show``."""
+        self._place({**variables, **parameters}, slice(None))
+        if parameters:
+            self._note_foreign(slice(None), True)
 
     def require_fit(self, columns: Columns) -> None:
         """See ``Engine.require_fit``."""

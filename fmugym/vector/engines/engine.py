@@ -15,6 +15,7 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.snapshot import Columns
+from fmugym.vector.calls import attribute
 
 __all__ = ["Engine", "StepResult", "failed_in"]
 
@@ -127,9 +128,10 @@ class Engine(ABC):
     def single(self, index: int) -> AbstractContextManager[FMUEnv]:
         """Lend one environment as a single one, to read it and call its methods."""
 
-    @abstractmethod
     def read(self, name: str, index: int) -> Any:
         """Read an attribute, or else a parameter of the FMU, of one environment."""
+        with self.single(index) as env:
+            return attribute(env, name)
 
     @abstractmethod
     def call(
@@ -209,12 +211,13 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def set_variable(self, name: str, value: float) -> None:
-        """Give an episode variable of all environments a value."""
+    def show(self, variables: Mapping[str, float], parameters: Mapping[str, FloatArray]) -> None:
+        """Let hooks of all environments read other values in these episodes.
 
-    @abstractmethod
-    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
-        """Let hooks read other values of parameters, arrays of shape (N,), in these episodes."""
+        Args:
+            variables: Those of episode variables, by name.
+            parameters: Those of parameters, arrays of shape (N,) by name.
+        """
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """Do many steps in one call; nobody needs the episodes afterwards.

@@ -28,7 +28,6 @@ from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.vector.action_arrays import checked_actions, is_array_space
-from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered, mapped
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult
@@ -83,10 +82,6 @@ class PerEnvEngine(Engine):
         """See ``Engine.single``."""
         yield self._envs[index]
 
-    def read(self, name: str, index: int) -> Any:
-        """See ``Engine.read``."""
-        return attribute(self._envs[index], name)
-
     def call(
         self,
         name: str,
@@ -95,7 +90,7 @@ class PerEnvEngine(Engine):
         keywords: Mapping[str, Any],
     ) -> list[Any]:
         """See ``Engine.call``."""
-        values = [attribute(self._envs[index], name) for index in indices]
+        values = [self.read(name, index) for index in indices]
         return [v(*arguments, **keywords) if callable(v) else v for v in values]
 
     def evaluate(
@@ -282,16 +277,13 @@ class PerEnvEngine(Engine):
         finally:
             self.offsets = None
 
-    def set_variable(self, name: str, value: float) -> None:
-        """See ``Engine.set_variable``."""
-        for env in self._envs:
-            env.variables[name] = value
-
-    def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
-        """See ``Engine.show_parameters``."""
+    def show(self, variables: Mapping[str, float], parameters: Mapping[str, FloatArray]) -> None:
+        """See ``Engine.show``."""
         for index, env in enumerate(self._envs):
-            own = {name: float(numbers[index]) for name, numbers in values.items()}
-            env.parameters = MappingProxyType({**env.parameters, **own})
+            env.variables.update(variables)
+            if parameters:
+                own = {name: float(numbers[index]) for name, numbers in parameters.items()}
+                env.parameters = MappingProxyType({**env.parameters, **own})
 
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
