@@ -26,7 +26,6 @@ from fmugym.export.imperfections import without_imperfections
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph, Node
-from fmugym.vector.hooks.lowering import Store
 from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbolic import element_names
@@ -178,20 +177,11 @@ class _ControllerTracer(Tracer):
     def __init__(self, env: FMUEnv, decision: Decision) -> None:
         super().__init__(env, {})
         self._decision = decision
-        self._trace()
+        self.settle(self._trace)
 
     def _trace(self) -> None:
-        """Trace the hooks, again if ``_update`` gives variables other types."""
-        for _ in range(3):
-            before = dict(self._variables)
-            self._begin(judging=True)
-            stores, updated = self._trace_update()
-            if self._variables == before:
-                self._trace_rest(stores, updated)
-                return
-        raise UntraceableError("_update gives a variable another type in each step")
-
-    def _trace_rest(self, stores: list[Store], updated: tuple[str, ...]) -> None:
+        self._begin(judging=True)
+        stores, updated = self._trace_update()
         nodes: dict[str, list[int]] = {name: [] for name in updated}
         for store in stores:
             row: Any = store.row

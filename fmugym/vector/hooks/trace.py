@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -44,10 +44,6 @@ __all__ = [
     "SeenArray",
     "TracedTask",
     "Tracer",
-    "in_hook",
-    "require_unchanged",
-    "tables_of",
-    "to_integer",
     "trace_hooks",
 ]
 
@@ -66,6 +62,8 @@ class SeenArray:
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
+
+_Made = TypeVar("_Made")
 
 _Seen = tuple[tuple[str, ...], npt.NDArray[Any], np.dtype[Any]]
 """The path and the type of a ``SeenArray``, and the nodes of the values in it."""
@@ -144,7 +142,8 @@ def trace_hooks(
     if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
         raise UntraceableError(f"its actions are {env.action_space.dtype}")
     with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
-        return Tracer(env, attributes, refused).task()
+        tracer = Tracer(env, attributes, refused)
+        return tracer.settle(tracer.task)
 
 
 class Tracer:
@@ -171,19 +170,20 @@ class Tracer:
             name: np.dtype(np.float64) for name in env.variables
         }
 
-    def task(self) -> TracedTask:
-        """Trace all hooks, again if ``_update`` gives variables other types.
+    def settle(self, trace: Callable[[], _Made]) -> _Made:
+        """Call what traces hooks, again if ``_update`` gives variables other types.
 
         From the second step on, hooks on arrays read a variable in the type that was assigned.
         """
         for _ in range(3):
             before = dict(self._variables)
-            task = self._traced()
+            made = trace()
             if self._variables == before:
-                return task
+                return made
         raise UntraceableError("_update gives a variable another type in each step")
 
-    def _traced(self) -> TracedTask:
+    def task(self) -> TracedTask:
+        """Trace all hooks."""
         self._left = {}
         inputs = self._trace_inputs()
         tolerance = self._graph.tolerance
