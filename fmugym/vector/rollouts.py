@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable, checked_value, unlisted
-from fmugym.checks import check_mapping, check_number, check_seed
+from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
 from fmugym.task.snapshot import Columns
@@ -162,7 +162,8 @@ class Candidates:
                 possible.
         """
         if callable(actions):
-            return cls(num_envs, _checked_horizon(horizon), num_envs, actions)
+            steps = check_count("the horizon, which a policy needs,", horizon)
+            return cls(num_envs, steps, num_envs, actions)
         array = _checked_array(space, actions)
         if horizon not in (None, array.shape[1]):
             raise ConfigError(f"the actions have {array.shape[1]} steps, but horizon = {horizon}")
@@ -380,16 +381,3 @@ def _without(result: StepResult, before: Any, over: MaskArray) -> StepResult:
     result.rewards[over] = 0.0
     result.terminated[over] = result.truncated[over] = False
     return result
-
-
-def _checked_horizon(horizon: Any) -> int:
-    """Check the number of steps of a policy.
-
-    Raises:
-        ConfigError: If it is no positive integer.
-    """
-    if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
-        raise ConfigError(
-            f"a rollout of a policy needs a horizon, a positive integer, got {shown(horizon)}"
-        )
-    return int(horizon)

@@ -235,7 +235,7 @@ class TestRefusals:
             (np.zeros((0, 3), int), "shape"),
             ([[0, 1], [0, 2]], "candidate 1: action 2 of step 1"),
             ("left", "shape"),
-            (lambda observations: [0, 0], "needs a horizon"),
+            (lambda observations: [0, 0], "horizon.*positive integer, got None"),
         ):
             with pytest.raises(ConfigError, match=reason):
                 envs.rollout(snapshot, actions)
