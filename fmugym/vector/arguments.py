@@ -26,7 +26,6 @@ __all__ = [
     "POOL_OPTIONS",
     "UnknownAttributeError",
     "autoreset_mode_of",
-    "checked_mask",
     "checked_num_envs",
     "checked_pool_options",
     "checked_seeds",
@@ -41,8 +40,6 @@ POOL_OPTIONS: Final = ("threads", "private_libraries", "isolation", "workers", "
 
 ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode", "hooks")
 """The arguments that are not."""
-
-_BOOL: Final = np.dtype(np.bool_)
 
 _LEAST_BYTES_PER_ENV: Final = 1024
 """An FMU instance and its columns of the arrays take more than this."""
@@ -175,17 +172,11 @@ def split_options(options: Any, num_envs: int) -> tuple[dict[str, Any], MaskArra
     Raises:
         ConfigError: If the options are neither None nor a dict, or the mask does not fit.
     """
-    if type(options) is dict and len(options) == 1 and "reset_mask" in options:  # most common
-        mask = options["reset_mask"]
-        if type(mask) is np.ndarray and mask.dtype is _BOOL and mask.shape == (num_envs,):
-            copy = mask.copy()  # first, because the caller's array may change
-            if 1 in copy.tobytes():  # a tenth of the time of any()
-                return {}, copy
     remaining = {} if options is None else check_mapping("the options of reset", options)
-    return remaining, checked_mask(remaining.pop("reset_mask", None), num_envs)
+    return remaining, _checked_mask(remaining.pop("reset_mask", None), num_envs)
 
 
-def checked_mask(mask: Any, num_envs: int) -> MaskArray:
+def _checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """Copy ``options["reset_mask"]``; None stands for all environments.
 
     Raises:
