@@ -35,46 +35,35 @@ def __getattr__(name: str) -> Callable[..., Any]:
     return vectorized(f"{module}:{attribute}")
 
 
-class VectorEntryPoint:
-    """Makes vector environments of one class; see ``vectorized``.
+def _make(
+    env_class: Callable[..., Any] | str,
+    num_envs: int = 1,
+    max_episode_steps: int | None = None,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    hooks: str = "auto",
+    backend: Any = "auto",
+    **kwargs: Any,
+) -> FMUVectorEnv:
+    from fmugym.vector.arguments import ARGUMENTS, POOL_OPTIONS  # registration shall be quick
+    from fmugym.vector.vector_env import FMUVectorEnv
 
-    It pickles if the class does.
-    """
-
-    def __init__(self, env_class: Callable[..., Any] | str) -> None:
-        self._env_class = env_class
-
-    def __call__(
-        self,
-        num_envs: int = 1,
-        max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        hooks: str = "auto",
-        backend: Any = "auto",
-        **kwargs: Any,
-    ) -> FMUVectorEnv:
-        """Make a vector environment; see ``FMUVectorEnv``."""
-        from fmugym.vector.arguments import ARGUMENTS, POOL_OPTIONS  # registration shall be quick
-        from fmugym.vector.vector_env import FMUVectorEnv
-
-        pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
-        env_class = self._env_class
-        creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class
-        if not isinstance(backend, str):  # it names no pool: the class knows what to do with it
-            kwargs["backend"], backend = backend, "auto"
-        try:
-            return FMUVectorEnv(
-                partial(creator, **kwargs),
-                num_envs,
-                max_episode_steps=max_episode_steps,
-                autoreset_mode=autoreset_mode,
-                hooks=hooks,
-                backend=backend,
-                **pool_options,
-            )
-        except ArgumentError as error:
-            more = ", ".join(map(repr, (*ARGUMENTS[1:], *POOL_OPTIONS)))
-            raise ArgumentError(f"{error}; a vector environment also takes {more}") from None
+    pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
+    creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class
+    if not isinstance(backend, str):  # it names no pool: the class knows what to do with it
+        kwargs["backend"], backend = backend, "auto"
+    try:
+        return FMUVectorEnv(
+            partial(creator, **kwargs),
+            num_envs,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            hooks=hooks,
+            backend=backend,
+            **pool_options,
+        )
+    except ArgumentError as error:
+        more = ", ".join(map(repr, (*ARGUMENTS[1:], *POOL_OPTIONS)))
+        raise ArgumentError(f"{error}; a vector environment also takes {more}") from None
 
 
 def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEnv]:
@@ -85,6 +74,6 @@ def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEn
 
     Returns:
         A function that makes a ``FMUVectorEnv``. It takes the arguments of ``FMUVectorEnv`` except
-        ``make_env``, and passes all others to the class.
+        ``make_env``, and passes all others to the class. It pickles if the class does.
     """
-    return VectorEntryPoint(env_class)
+    return partial(_make, env_class)
