@@ -59,42 +59,36 @@ def require_pure(env: FMUEnv) -> None:
         UntraceableError: With the name.
     """
     for function in functions_of(env):
-        _require_plain_attributes(env, function)
-        _require_plain_places(function)
+        names = set(names_in(function.__code__))
+        if not _ACTING.isdisjoint(names):
+            acting = min(_ACTING & names)
+            raise UntraceableError(
+                f"{function.__name__} uses {acting}, which does not only compute"
+            )
+        for name in names:
+            value = getattr_static(env, name, None)
+            is_code = isinstance(value, _CODE) or hasattr(value, "__get__")
+            if not is_code and not isinstance(value, np.ndarray):
+                _require(_is_plain(value) or _is_ours(value), function, name, value)
+        for place, name in places_of(function):
+            value = place[name]
+            if isinstance(value, ModuleType):
+                _require_computing(function, value)
+            elif type(value) is not np.ndarray:
+                is_harmless = _is_plain(value) or _is_constant(value)
+                _require(is_harmless, function, name or "a variable", value)
+
+
+def _require(is_harmless: bool, function: FunctionType, name: str, value: Any) -> None:
+    if not is_harmless:
+        raise UntraceableError(
+            f"{function.__name__} refers to {name}, a {type(value).__name__} that it could change"
+        )
 
 
 def names_in_hooks(env: FMUEnv) -> set[str]:
     """The names of the attributes and globals to which hooks refer."""
     return {name for function in functions_of(env) for name in names_in(function.__code__)}
-
-
-def _require_plain_places(function: FunctionType) -> None:
-    acting = _ACTING.intersection(names_in(function.__code__))
-    if acting:
-        raise UntraceableError(
-            f"{function.__name__} uses {min(acting)}, which does not only compute"
-        )
-    for place, name in places_of(function):
-        value = place[name]
-        if isinstance(value, ModuleType):
-            _require_computing(function, value)
-        elif not _is_plain(value) and type(value) is not np.ndarray and not _is_constant(value):
-            raise UntraceableError(
-                f"{function.__name__} refers to {name or 'a variable'}, a {type(value).__name__} "
-                "that it could change"
-            )
-
-
-def _require_plain_attributes(env: FMUEnv, function: FunctionType) -> None:
-    """Refuse functions that refer to objects among the attributes, which they could change."""
-    for name in set(names_in(function.__code__)):
-        value = getattr_static(env, name, None)
-        is_harmless = _is_plain(value) or isinstance(value, np.ndarray) or _is_ours(value)
-        if not is_harmless and not isinstance(value, _CODE) and not hasattr(value, "__get__"):
-            raise UntraceableError(
-                f"{function.__name__} refers to {name}, a {type(value).__name__} "
-                "that it could change"
-            )
 
 
 _CODE: Final = (FunctionType, classmethod, staticmethod, property, type, MappingProxyType)
