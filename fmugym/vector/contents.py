@@ -116,7 +116,8 @@ class Contents:
         for place, name, value in self._outside:
             if differs(value, place[name]):
                 changed.append(name or type(value).__name__)
-        return Changes(self._changed_inside(), _first(changed), _first(added))
+        first, first_added = (next(iter(names), None) for names in (changed, added))
+        return Changes(self._changed_inside(), first, first_added)
 
     def _changed_inside(self) -> str | None:
         before, now, in_place = self._before, self._attributes, self.changed_in_place()
@@ -170,10 +171,6 @@ def _size_of(value: Any) -> int:
     if isinstance(value, np.ndarray):
         return value.size
     return len(value) if isinstance(value, (list, dict, set, tuple, deque)) else 1
-
-
-def _first(names: list[str]) -> str | None:
-    return names[0] if names else None
 
 
 def _was_added_to(kept: _Kept) -> bool:

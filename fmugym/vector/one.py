@@ -6,7 +6,6 @@ import logging
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -334,7 +333,9 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
     changed = changes.outside or changes.added
     if changed is not None:
         raise UntraceableError(f"it changes {changed} outside of self")
-    with _repeated(env, numbers, len(near.step_count)):
+    count = len(near.step_count)
+    with borrowed(env):
+        vars(env).update({name: np.repeat(number, count) for name, number in numbers.items()})
         task = compile_hooks(env, [near, far], numbers)
     if task.left:
         raise UntraceableError("; ".join(task.left.values()))
@@ -358,18 +359,6 @@ def _is_debugged() -> bool:
     """Whether something follows each line, except for what measures the coverage of tests."""
     follower = sys.gettrace()
     return follower is not None and not type(follower).__module__.startswith("coverage")
-
-
-@contextmanager
-def _repeated(env: FMUEnv, numbers: Mapping[str, Any], count: int) -> Iterator[None]:
-    """Let hooks read numbers as those of several environments."""
-    attributes = vars(env)
-    before = {name: attributes[name] for name in numbers}
-    attributes.update({name: np.repeat(number, count) for name, number in numbers.items()})
-    try:
-        yield
-    finally:
-        attributes.update(before)
 
 
 def _exactly(value: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:

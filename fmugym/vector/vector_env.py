@@ -313,11 +313,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _step(self, actions: Any, in_background: bool = False) -> StepResult:
         inside = self.inside
-        is_busy = self._background.is_pending and not in_background
-        if not inside.episodes.is_ready or self.closed or is_busy:
-            self._refuse_step("step")
         engine = inside.engine
-        if engine.any_ended and self._waits:
+        is_busy = self._background.is_pending and not in_background
+        has_to_wait = engine.any_ended and self._waits
+        if not inside.episodes.is_ready or self.closed or is_busy or has_to_wait:
             self._require_ready("step")
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)

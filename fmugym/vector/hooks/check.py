@@ -129,12 +129,11 @@ def sample_states(
     """
     rng = np.random.default_rng(0)
     visited = _visit_states(env, rng) if visited is None else visited
-    count = len(visited) * len(scales)
-    batch = batched(env, count)
+    tried = [(state, scale) for state in visited for scale in scales]
+    batch = batched(env, len(tried))
     rows: dict[str, list[Any]] = {}
-    for index in range(count):
-        _place_sample(env, batch, index, visited[index // len(scales)], rng, rows)
-        scale = scales[index % len(scales)]
+    for index, (state, scale) in enumerate(tried):
+        _place_sample(env, batch, index, state, rng, rows)
         if scale != 1.0:
             batch.values[:, index] *= scale * rng.uniform(0.5, 1.5, size=len(batch.values))
             batch.previous_state[:, index] *= scale
