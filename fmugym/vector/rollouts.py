@@ -366,13 +366,11 @@ def roll_out_by_steps(
         observations = result.observations
         results.append(result)
     costs = [costs_in(result.infos, result.rewards.shape) for result in results]
-    return Rollout.of(
-        mapped(lambda *arrays: np.stack(arrays), *(result.observations for result in results)),
-        np.stack([result.rewards for result in results]),
-        np.stack([result.terminated for result in results]),
-        np.stack([result.truncated for result in results]),
-        {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in _names(costs)},
+    seen, rewards, terminated, truncated = mapped(
+        lambda *arrays: np.stack(arrays), *(result[:4] for result in results)
     )
+    paid = {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in _names(costs)}
+    return Rollout.of(seen, rewards, terminated, truncated, paid)
 
 
 def _without(result: StepResult, before: Any, over: MaskArray) -> StepResult:
