@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,7 @@ __all__ = [
     "SeenArray",
     "TracedTask",
     "Tracer",
+    "of_input_type",
     "trace_hooks",
 ]
 
@@ -262,7 +263,7 @@ class Tracer:
         if len(value) != len(variables):
             raise UntraceableError("the number of inputs is not that of the config")
         rows = [self._row(row, np.float64) for row in value]
-        typed = map(_of_input_type, variables, rows)
+        typed = map(of_input_type, variables, rows)
         return [int(same_for_all(row)) for row in typed]
 
     # What follows the FMU's step.
@@ -295,9 +296,9 @@ class Tracer:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
         self._variables[name] = type_of_variable(self._env.inside.draws, name, symbols.dtype)
-        kept: Symbols = np.where(self._told("active"), symbols.cast(old.dtype), old)
+        kept: Any = np.where(self._told("active"), symbols.cast(old.dtype), old)
         kept.writeable = False
-        return kept
+        return cast(Symbols, kept)
 
     def _or_left(self, name: str, of: Callable[[Any], Any], constant: Any) -> Any:
         """Trace a hook. If that fails, leave it to numpy; a constant takes its place."""
@@ -371,7 +372,7 @@ def _stores(parts: list[_Seen]) -> list[Store]:
     ]
 
 
-def _of_input_type(variable: Any, value: Any) -> Any:
+def of_input_type(variable: Any, value: Any) -> Any:
     """Round a value to its input's type, as ``to_input_types`` does.
 
     A value that is outside of the type's range becomes NaN, which no pool steps with.
