@@ -58,13 +58,13 @@ def compile_graph(
         UntraceableError: If there are too many operations, or the pool does not have one of them.
     """
     compiler = _Compiler(graph)
-    compiler.number_outputs(stores)
-    for store in stores:
-        if compiler.observes_output(store):
-            compiler.store_output(store)
-        else:
+    rows = compiler.number_outputs(stores)
+    for store, row in zip(stores, rows, strict=True):
+        if row is None:
             compiler.evaluate(store.node)
             compiler.store(store)
+        else:
+            compiler.store_output(store, row)
     for node in results:
         compiler.evaluate(node)
     return compiler.program(results, seen)
@@ -107,27 +107,23 @@ class _Compiler:
         if len(self._steps) > _MOST_INSTRUCTIONS:
             raise UntraceableError(f"it has more than {_MOST_INSTRUCTIONS} operations")
 
-    def observes_output(self, store: Store) -> bool:
-        """Whether it stores an output of the FMU as a float32, as most observations do."""
+    def number_outputs(self, stores: Sequence[Store]) -> list[int | None]:
+        """Let the rows of outputs that are observed side by side follow each other."""
+        return [self._output_row(store) for store in stores]
+
+    def _output_row(self, store: Store) -> int | None:
+        """The row of the FMU's output that it stores as a float32, as most observations do."""
         node = self._graph.nodes[store.node]
         if store.row is not None or node.kind != "cast" or node.dtype != np.float32:
-            return False
+            return None
         source = self._graph.nodes[node.operands[0]]
         what: Any = source.what
-        return source.kind == "row" and what[0] == "output"
+        is_output = source.kind == "row" and what[0] == "output"
+        return self._place(self._rows, what) if is_output else None
 
-    def _output_row(self, store: Store) -> int:
-        node = self._graph.nodes[self._graph.nodes[store.node].operands[0]]
-        return self._place(self._rows, node.what)
-
-    def number_outputs(self, stores: Sequence[Store]) -> None:
-        """Let the rows of outputs that are observed side by side follow each other."""
-        for store in filter(self.observes_output, stores):
-            self._output_row(store)
-
-    def store_output(self, store: Store) -> None:
+    def store_output(self, store: Store, row: int) -> None:
         """Store an output in the same instruction as the one before, if they are neighbours."""
-        row, slot = self._output_row(store), len(self._slots)
+        slot = len(self._slots)
         self._slots.append((*store.slot, TYPES.index("f")))
         last = self._steps[-1] if self._steps else None
         if last is not None and last.operation == "store_floats":
