@@ -111,8 +111,11 @@ def checked_pool_options(options: Mapping[str, Any], num_envs: int) -> dict[str,
     checked = {name: value for name, value in options.items() if value is not None}
     for name in checked.keys() & {"threads", "workers"}:
         checked[name] = min(check_count(name, checked[name]), num_envs)
-    if "call_timeout" in options:
-        checked["call_timeout"] = _checked_timeout(options["call_timeout"])
+    if "call_timeout" in checked:
+        what = "call_timeout, in seconds or None,"
+        checked["call_timeout"] = check_number(what, checked["call_timeout"], positive=True)
+    elif "call_timeout" in options:
+        checked["call_timeout"] = None  # no limit
     apart = checked.get("private_libraries", False)
     if not isinstance(apart, bool | np.bool_):
         raise ConfigError(f"private_libraries must be True, False or None, got {shown(apart)}")
@@ -120,14 +123,6 @@ def checked_pool_options(options: Mapping[str, Any], num_envs: int) -> dict[str,
     if not isinstance(where, str):
         raise ConfigError(f"isolation must be 'none', 'process' or None, got {shown(where)}")
     return checked
-
-
-def _checked_timeout(value: Any) -> float | None:
-    if value is None:
-        return None
-    if isinstance(value, bool | np.bool_ | np.ndarray):
-        raise ConfigError(f"call_timeout must be a number of seconds or None, got {shown(value)}")
-    return check_number("call_timeout", value, positive=True)
 
 
 def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:

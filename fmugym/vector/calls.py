@@ -53,12 +53,6 @@ def attribute(env: FMUEnv, name: str) -> Any:
         raise UnknownAttributeError(str(error)) from None
 
 
-def _require_unchanged(before: Readings, after: Readings) -> None:
-    for name in READINGS:
-        if getattr(before, name) is not getattr(after, name):
-            require_settable(name)
-
-
 class MethodCalls:
     """What a method has assigned, which is called for some environments of a batch.
 
@@ -98,7 +92,10 @@ class MethodCalls:
         try:
             value = attribute(env, name)
             returned = value(*arguments, **keywords) if callable(value) else value
-            _require_unchanged(readings, Readings.of(env))
+            now = Readings.of(env)
+            for reading in READINGS:
+                if getattr(readings, reading) is not getattr(now, reading):
+                    require_settable(reading)
             self._note_attributes(index, before, vars(env), contents.changed_in_place())
             for variable, number in env.variables.items():
                 if variables[variable] is not number:
