@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from fmugym.declared import Task, load
 from fmugym.env import FMUEnv
@@ -17,7 +17,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.recording import Recorder, Recording
-from fmugym.tools.options import MINARI, only_player, say, say_json
+from fmugym.tools.options import MINARI, only_player, say_result
 from fmugym.tools.targets import maker_of
 
 __all__ = ["add_of_datasets", "dataset_of", "make_dataset", "renaming", "show_dataset"]
@@ -141,10 +141,7 @@ def _played(
 def _show(
     arguments: argparse.Namespace, name: str, recordings: Sequence[Recording], what: str
 ) -> None:
-    steps = sum(map(len, recordings))
-    if not arguments.json:
-        say(f"{what}: {len(recordings)} episodes, {steps} steps")
-        return
+    count, steps = len(recordings), sum(map(len, recordings))
     rewards = [float(one.rewards.sum()) for one in recordings]
-    facts: dict[str, Any] = {"dataset": name, "episodes": len(recordings)}
-    say_json({**facts, "steps": steps, "rewards": rewards})
+    facts = {"dataset": name, "episodes": count, "steps": steps, "rewards": rewards}
+    say_result(arguments, facts, f"{what}: {count} episodes, {steps} steps")

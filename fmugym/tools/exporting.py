@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
@@ -15,11 +14,13 @@ from fmugym.export.building import PLATFORMS
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.export.names import new_file
 from fmugym.search.policy import Agent as FoundAgent
-from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say, say_json
+from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say_result
 from fmugym.tools.targets import maker_of
 from fmugym.training.agents import read_agent
 
 __all__ = ["add_export"]
+
+_ENDINGS: Final = (".c", ".fmu", ".onnx")
 
 
 def add_export(commands: Commands) -> None:
@@ -66,9 +67,9 @@ def add_export(commands: Commands) -> None:
 
 def _export(arguments: argparse.Namespace) -> None:
     output: Path = arguments.output
-    if output.suffix not in _WRITERS:
+    if output.suffix not in _ENDINGS:
         raise ConfigError(
-            f"expected a file that ends in {', '.join(_WRITERS)}, got {shown(str(output))}"
+            f"expected a file that ends in {', '.join(_ENDINGS)}, got {shown(str(output))}"
         )
     new_file(output)
     model, normalization = read_agent(arguments.agent, arguments.algorithm)
@@ -76,31 +77,20 @@ def _export(arguments: argparse.Namespace) -> None:
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:
         options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
         agent = agent_of(env, model, normalization, name=output.stem, **options)
-    files = _WRITERS[output.suffix](agent, output, arguments)
-    _show(agent, files, arguments)
+    _show(agent, _written(agent, output, arguments), arguments)
 
 
-def _as_c(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
-    return write_c(agent, output.parent)
-
-
-def _as_fmu(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+def _written(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+    """Write an agent in the format that the file's ending tells."""
+    if output.suffix == ".c":
+        return write_c(agent, output.parent)
+    if output.suffix == ".onnx":
+        return [write_onnx(agent, output)]
     platforms = arguments.platform
     if platforms is not None and "all" in platforms:
         is_new = arguments.fmi != "2.0"
         platforms = [name for name, one in PLATFORMS.items() if is_new or one.folder]
     return [write_fmu(agent, output, fmi_version=arguments.fmi, platforms=platforms)]
-
-
-def _as_onnx(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
-    return [write_onnx(agent, output)]
-
-
-_WRITERS: Final[dict[str, Callable[[Agent, Path, argparse.Namespace], list[Path]]]] = {
-    ".c": _as_c,
-    ".fmu": _as_fmu,
-    ".onnx": _as_onnx,
-}
 
 
 def _show(agent: Agent, files: list[Path], arguments: argparse.Namespace) -> None:
@@ -110,15 +100,13 @@ def _show(agent: Agent, files: list[Path], arguments: argparse.Namespace) -> Non
         "actions": [_facts(one) for one in logic.inputs],
         "parameters": [{"name": one.name, "start": one.start} for one in logic.parameters],
     }
-    if arguments.json:
-        names = {"task": arguments.task, "files": list(map(str, files))}
-        say_json({**names, "name": agent.name, "sample_time": logic.time_step, **parts})
-        return
-    say(f"{', '.join(map(str, files))}: a sample every {logic.time_step:g} s")
+    facts = {"files": files, "name": agent.name, "sample_time": logic.time_step, **parts}
+    lines = [f"{', '.join(map(str, files))}: a sample every {logic.time_step:g} s"]
     for title, rows in parts.items():
         for row in rows:
             more = f" = {row['start']:g}" if "start" in row else f" {row['unit'] or ''}".rstrip()
-            say(f"  {title.removesuffix('s')} {row['name']}{more}")
+            lines.append(f"  {title.removesuffix('s')} {row['name']}{more}")
+    say_result(arguments, facts, "\n".join(lines))
 
 
 def _facts(variable: Variable) -> dict[str, Any]:

@@ -25,8 +25,7 @@ from fmugym.tools.options import (
     check_numbers,
     note,
     require_toml,
-    say,
-    say_json,
+    say_result,
     write_extension,
 )
 from fmugym.tools.targets import maker_of
@@ -146,11 +145,7 @@ def _start(text: str) -> tuple[str, str | None]:
 
 
 def _show(fit: FitResult, arguments: argparse.Namespace) -> None:
-    if arguments.json:
-        say_json({"task": arguments.task, "output": arguments.output, **_facts(fit)})
-    else:
-        for line in _table(fit):
-            say(line)
+    say_result(arguments, _facts(fit), "\n".join(_table(fit)))
     for one in _warnings(fit):
         note(one)
 

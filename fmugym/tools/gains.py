@@ -20,8 +20,7 @@ from fmugym.tools.options import (
     check_numbers,
     note,
     require_toml,
-    say,
-    say_json,
+    say_result,
     tell,
     write_extension,
 )
@@ -105,12 +104,9 @@ def _show(search: Search, best: Tuning, arguments: argparse.Namespace) -> None:
         write_extension(output, arguments.task, {"controllers": {arguments.name: text}})
     for name in search.at_an_end(best.parameters):
         note(f"the best {name} is at an end of its range; a wider one may have a better one")
-    if not arguments.json:
-        say(text)
-        return
     facts = {"controller": text, "parameters": search.numbers(best.parameters)}
     reward = {"mean_reward": best.mean_return, "rewards_of_rounds": best.returns}
-    say_json({"task": arguments.task, "output": output, **facts, **reward})
+    say_result(arguments, {**facts, **reward}, text)
 
 
 def _require_name(name: str) -> None:

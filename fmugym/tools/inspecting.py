@@ -25,6 +25,7 @@ from fmugym.tools.options import (
     add_task,
     say,
     say_json,
+    say_result,
     write_text,
 )
 from fmugym.tools.overview import as_text, overview
@@ -112,29 +113,25 @@ def _repair(arguments: argparse.Namespace, fmu: FMU) -> None:
         _replace_libraries(arguments, fmu)
         return
     made = compile_fmu(fmu.path, arguments.output)
-    if arguments.json:
-        say_json({"output": made})
-    else:
-        say(plain(f"{made}: compiled for {FMU(made).platform}"))
+    say_result(arguments, {"output": made}, plain(f"{made}: compiled for {FMU(made).platform}"))
 
 
 def _replace_libraries(arguments: argparse.Namespace, fmu: FMU) -> None:
     built = build_stand_in(fmu, arguments.output or Path())
-    if arguments.json:
-        libraries = [
-            {"path": one.path, "functions": list(one.served), "without": list(one.lacking)}
-            for one in built
-        ]
-        say_json({"preload": [one.path for one in built], "libraries": libraries})
-        return
-    for library in built:
-        say(plain(f"{library.path}: {len(library.served)} functions"))
-        for name in library.lacking:
-            say(plain(f"  without {name}: an FMU that calls it ends its process"))
-    line = preload_line([str(library.path) for library in built])
-    say(f"Put it into the task file, below [foreign]: {line}")
+    libraries, lines = [], []
+    for one in built:
+        libraries.append({"path": one.path, "functions": one.served, "without": one.lacking})
+        lines.append(plain(f"{one.path}: {len(one.served)} functions"))
+        without = (
+            f"  without {name}: an FMU that calls it ends its process" for name in one.lacking
+        )
+        lines += map(plain, without)
+    paths = [one.path for one in built]
+    line = preload_line([*map(str, paths)])
     names = line.removeprefix("preload = ")
-    say(f'or into the config of a class: "foreign": {{"preload": {names}}}')
+    lines.append(f"Put it into the task file, below [foreign]: {line}")
+    lines.append(f'or into the config of a class: "foreign": {{"preload": {names}}}')
+    say_result(arguments, {"preload": paths, "libraries": libraries}, "\n".join(lines))
 
 
 def add_new(commands: Commands) -> None:
@@ -179,8 +176,5 @@ def add_validate(commands: Commands) -> None:
 
 def _validate(arguments: argparse.Namespace) -> int:
     report = validate(maker_of(arguments.task, master=arguments.master, takes_fmu=True))
-    if arguments.json:
-        say_json({"task": arguments.task, **report.as_dict()})
-    else:
-        say(report.as_text())
+    say_result(arguments, report.as_dict(), report.as_text())
     return int(report.verdict == "error")

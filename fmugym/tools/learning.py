@@ -24,8 +24,7 @@ from fmugym.tools.options import (
     add_json,
     add_task,
     check_numbers,
-    say,
-    say_json,
+    say_result,
     tell,
 )
 from fmugym.tools.targets import maker_of, scenarios_of
@@ -182,10 +181,8 @@ def _search(arguments: argparse.Namespace) -> None:
             _tell_what_is_kept(arguments.output, STATE)
             raise
     write_curve(arguments.output, f"{title_of(arguments.task)}, trained by a search", tell)
-    if arguments.json:
-        say_json({"task": arguments.task, "output": arguments.output, **facts})
-    else:
-        say(facts["verdict"])
+    say_result(arguments, facts, facts["verdict"])
+    if not arguments.json:
         _tell_faults(
             {name: one["mean_costs"]["failed episodes"] for name, one in facts["test"].items()}
         )
@@ -298,10 +295,7 @@ def _tuned(settings: TrainingSettings, arguments: argparse.Namespace) -> Trainin
 
 
 def _show(settings: TrainingSettings, scores: list[Score], arguments: argparse.Namespace) -> None:
-    if not arguments.json:
-        say(table(scores))
-        return
     best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
-    facts = {"task": arguments.task, "output": arguments.output, "steps": settings.steps}
     told = {"best": best, "scores": [one.as_dict() for one in scores]}
-    say_json({**facts, **settings.facts(), **told})
+    facts = {"steps": settings.steps, **settings.facts(), **told}
+    say_result(arguments, facts, table(scores))

@@ -44,6 +44,7 @@ __all__ = [
     "require_toml",
     "say",
     "say_json",
+    "say_result",
     "shown_in_any_case",
     "speaking",
     "tell",
@@ -356,6 +357,15 @@ def _outputs_of(arguments: argparse.Namespace) -> Iterator[Path]:
 def say_json(facts: dict[str, Any]) -> None:
     """Print one JSON object."""
     say(json.dumps({"schema": SCHEMA, **facts}, indent=2, default=str))
+
+
+def say_result(arguments: argparse.Namespace, facts: Mapping[str, Any], text: str) -> None:
+    """Print what a command has found: with ``--json`` as one JSON object, otherwise as a text."""
+    if not arguments.json:
+        say(text)
+        return
+    given = {name: one for name, one in vars(arguments).items() if name in ("task", "output")}
+    say_json({**given, **facts})
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from fmugym.tools.options import (
     check_numbers,
     only_player,
     say,
-    say_json,
+    say_result,
     shown_in_any_case,
 )
 
@@ -96,14 +96,10 @@ def follow_plant(arguments: argparse.Namespace) -> None:
 
 
 def _show(arguments: argparse.Namespace, done: Sequence[Summary], errors: Sequence[Error]) -> None:
-    if arguments.json:
-        told = [one.as_dict() for one in done]
-        predictions = [one._asdict() for one in errors]
-        facts = {"task": arguments.task, "output": arguments.output}
-        say_json({**facts, "episodes": told, "predictions": predictions})
-        return
-    for line in _table(errors):
-        say(plain(line))
+    episodes, predictions = [one.as_dict() for one in done], [one._asdict() for one in errors]
+    text = "\n".join(map(plain, _table(errors)))
+    if text or arguments.json:
+        say_result(arguments, {"episodes": episodes, "predictions": predictions}, text)
 
 
 def _table(errors: Sequence[Error]) -> list[str]:
@@ -153,12 +149,10 @@ def _serve(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{shown(arguments.task)} has no [plant]: say --modbus or --opcua")
     with Server(task, player, clock=_clock(arguments), **options) as server:
         plant = {**task.document["plant"], "address": server.address}
-        if arguments.json:
-            say_json({"task": arguments.task, "address": server.address, "plant": plant})
-        else:
-            say(f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it")
-            if not has_plant:
-                say(f"add this to the task:\n\n{as_toml({'plant': plant})}")
+        text = f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it"
+        if not has_plant:
+            text += f"\nadd this to the task:\n\n{as_toml({'plant': plant})}"
+        say_result(arguments, {"address": server.address, "plant": plant}, text)
         sys.stdout.flush()  # a program may wait for the address
         with shown_in_any_case(lambda: _tell(arguments, server)):
             while not server.wait(0.2):

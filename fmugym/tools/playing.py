@@ -28,6 +28,7 @@ from fmugym.tools.options import (
     players_of,
     say,
     say_json,
+    say_result,
     shown_in_any_case,
 )
 from fmugym.tools.plants import add_of_plants, follow_plant, task_of
@@ -177,10 +178,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 def _show_scores(scores: list[Score], arguments: argparse.Namespace) -> None:
     if arguments.plot is not None and scores:
         plot_scores(scores, arguments.plot, title_of(arguments.task))
-    if arguments.json:
-        say_json({"task": arguments.task, "scores": [one.as_dict() for one in scores]})
-    else:
-        say(table(scores))
+    say_result(arguments, {"scores": [one.as_dict() for one in scores]}, table(scores))
 
 
 def _scenarios(arguments: argparse.Namespace) -> list[str | None]:
@@ -219,9 +217,5 @@ def _bench(arguments: argparse.Namespace) -> None:
 
 
 def _show_speeds(report: Report | None, arguments: argparse.Namespace) -> None:
-    if report is None:
-        return
-    if arguments.json:
-        say_json({"task": arguments.task, **report.as_dict()})
-    else:
-        say(speed_table(report))
+    if report is not None:
+        say_result(arguments, report.as_dict(), speed_table(report))

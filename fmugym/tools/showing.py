@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fmugym.errors import ConfigError, plain
 from fmugym.tools.demo import LinearController, Training, show, write_picture
-from fmugym.tools.options import Commands, add_command, add_json, check_numbers, say, say_json
+from fmugym.tools.options import Commands, add_command, add_json, check_numbers, say, say_result
 
 __all__ = ["add_demo"]
 
@@ -35,11 +35,9 @@ def _demo(arguments: argparse.Namespace) -> int:
                 f"round {one.number}: {one.mean:.0f} steps in the mean, {one.best:.0f} at best; "
                 f"controller {one.held_out:.0f} of 500"
             )
-    if arguments.json:
-        facts = {"steps": training.steps, "seconds": training.seconds}
-        say_json({"rounds": [asdict(one) for one in rounds], **facts})
-    else:
-        say(f"{training.steps} steps of the cart-pole FMU in {training.seconds:.2f} s")
+    steps, seconds = training.steps, training.seconds
+    facts = {"rounds": [asdict(one) for one in rounds], "steps": steps, "seconds": seconds}
+    say_result(arguments, facts, f"{steps} steps of the cart-pole FMU in {seconds:.2f} s")
     _show(untrained, training.controller, arguments)
     return int(not rounds or not rounds[-1].is_solved)
 
