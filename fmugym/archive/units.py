@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import operator
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 
 __all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
+
+_Value = TypeVar("_Value")
+"""A number, or an object that calculates like one."""
 
 
 @dataclass(frozen=True)
@@ -22,13 +26,17 @@ class Conversion:
     factor: float = 1.0
     offset: float = 0.0
 
-    def __call__(self, value: float) -> float:
+    def __call__(self, value: _Value) -> _Value:
         """Convert a value to the other unit."""
-        return value * self.factor + self.offset
+        if self.factor != 1.0:
+            value = operator.mul(value, self.factor)
+        return value if self.offset == 0.0 else operator.add(value, self.offset)
 
-    def inverse(self, value: float) -> float:
+    def inverse(self, value: _Value) -> _Value:
         """Convert a value of the other unit back."""
-        return (value - self.offset) / self.factor
+        if self.offset != 0.0:
+            value = operator.sub(value, self.offset)
+        return value if self.factor == 1.0 else operator.truediv(value, self.factor)
 
     def after(self, first: Conversion) -> Conversion:
         """The conversion that does another one first."""

@@ -21,7 +21,7 @@ from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import clip, maximum
 from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.quantities import nearest_steps, steps_in
-from fmugym.declared.variables import TaskVariable, converted
+from fmugym.declared.variables import TaskVariable
 from fmugym.errors import unknown_name
 from fmugym.task.future import Lookup
 from fmugym.vector.hooks.graph import Graph
@@ -350,13 +350,11 @@ class Naming:
         if name in declared.parameters:
             if variable.in_fmu is not None and variable.in_fmu.kind == "string":
                 raise variable.entry.error(f"{name!r} is a String: expressions have numbers only")
-            return converted(
-                variable.conversion, self.read("parameters", variable.fmu_variable.name)
-            )
+            return variable.conversion(self.read("parameters", variable.fmu_variable.name))
         if name not in self._places:
             raise ConsequenceError(f"{name!r} is no variable of the FMU")
         value = self.read("inside.readings.values", self._places[name])
-        return converted(variable.conversion, value)
+        return variable.conversion(value)
 
     def _previous_value_of(self, name: str) -> Value | None:
         declared, variable = self.declared, self.declared.variables.get(name)
@@ -366,7 +364,7 @@ class Naming:
             if not declared.knows_actions:
                 raise ConsequenceError(f"{name!r} may be an action")
             return None
-        return converted(variable.conversion, self.read("previous_state", self._places[name]))
+        return variable.conversion(self.read("previous_state", self._places[name]))
 
     def action(self, variable: TaskVariable, attribute: str) -> Value:
         """An action in the unit of the task.
@@ -447,11 +445,11 @@ class Naming:
             start = self.read("parameters", variable.fmu_variable.name)
         else:
             start = self.step_count * 0.0 + variable.in_fmu.start_number
-        return converted(variable.conversion, start)
+        return variable.conversion(start)
 
     def present(self, variable: TaskVariable) -> Value:
         """The value that an input has now, in the unit of the task."""
-        return converted(variable.conversion, self._written(variable))
+        return variable.conversion(self._written(variable))
 
     def _written(self, variable: TaskVariable) -> Value:
         return self.read("inputs", self.declared.written.index(variable.alias))

@@ -45,7 +45,7 @@ from fmugym.declared.piloting import DeclaredWarmUp
 from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
-from fmugym.declared.variables import TaskVariable, inverted, is_plain
+from fmugym.declared.variables import TaskVariable, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.task.future import Future
@@ -311,13 +311,13 @@ class ResolvedTask:
         for variable in declared.actions:
             if variable.in_fmu is None:
                 continue
-            value = inverted(variable.conversion, self._naming.input(variable))
+            value = variable.conversion.inverse(self._naming.input(variable))
             is_kept = acting is not None and variable.alias not in acting
             values.append(self._naming.read("inputs", len(values)) if is_kept else value)
         for name, (variable, expression) in declared.inputs.items():
             entry = self._root.child("inputs").child(name)
             value = self._naming.value(entry, expression, Moment.BEFORE).number
-            values.append(inverted(variable.conversion, value))
+            values.append(variable.conversion.inverse(value))
         if not values:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"

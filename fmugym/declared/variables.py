@@ -11,7 +11,6 @@ from typing import Any, Final
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
-from fmugym.declared.computed import Value
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
 from fmugym.declared.mistakes import ConsequenceError
@@ -26,8 +25,6 @@ __all__ = [
     "NAMING",
     "TaskVariable",
     "TaskVariables",
-    "converted",
-    "inverted",
     "is_plain",
     "start_value",
 ]
@@ -310,20 +307,6 @@ def _own_nominal(variable: Variable | None, conversion: Conversion) -> float | N
     """The nominal value of the FMU, unless its unit has another zero."""
     own = None if variable is None else variable.nominal
     return None if not own or conversion.offset else abs(own * conversion.factor)
-
-
-def converted(conversion: Conversion, value: Value) -> Value:
-    """Turn a value of the FMU into one of the task."""
-    if conversion.factor != 1.0:
-        value = value * conversion.factor
-    return value if conversion.offset == 0.0 else value + conversion.offset
-
-
-def inverted(conversion: Conversion, value: Value) -> Value:
-    """Turn a value of the task into one of the FMU."""
-    if conversion.offset != 0.0:
-        value = value - conversion.offset
-    return value if conversion.factor == 1.0 else value / conversion.factor
 
 
 def is_plain(variable: TaskVariable) -> bool:
