@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from fmugym.declared.computed import Value, function_of
@@ -48,12 +48,9 @@ def explanation(
 
 def _readers(term: Term, naming: Naming) -> dict[str, Callable[[Any], Any]]:
     """Functions for the values that a term reads, by their texts."""
+    names = sorted(term.expression.names - CONSTANTS.keys())
+    before = sorted(term.expression.previous_names)
     return {
         text: function_of(naming.value(term.entry, Expression.parse(text), Moment.JUDGED).number)
-        for text in _read_by(term.expression)
+        for text in (*names, *(f"previous({name})" for name in before))
     }
-
-
-def _read_by(expression: Expression) -> Iterator[str]:
-    yield from sorted(expression.names - CONSTANTS.keys())
-    yield from (f"previous({name})" for name in sorted(expression.previous_names))

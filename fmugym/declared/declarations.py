@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from itertools import product
 from typing import Any, Final, TypeVar
 
@@ -73,7 +73,7 @@ class Declarations:
         """Read all sections, and note their mistakes, and what does not fit the FMU."""
         self.root, self.is_physical = root, is_physical
         self.variables = TaskVariables(root, description)
-        self._declared = [name for section in NAMING[1:] for name in _names(root, section)]
+        self._declared = [one for name in NAMING[1:] for one in root.child(name).value or ()]
         _check_names(root)
         self.memory = _read(root, "memory", read_memory)
         self.derived = _read(root, "expressions", read_derived)
@@ -375,11 +375,6 @@ def _check_name(entry: Entry, seen: Collection[str]) -> None:
         raise entry.error(
             f"{name!r} cannot be used in expressions; choose a name of letters, digits and _"
         )
-
-
-def _names(root: Entry, section: str) -> Iterable[str]:
-    """The names that a section declares, also those that have mistakes."""
-    return root.child(section).value or ()
 
 
 def _read(root: Entry, section: str, read: Callable[[Entry], _Read]) -> dict[str, _Read]:

@@ -61,12 +61,8 @@ class Source(NamedTuple):
             if shared > found and list(path[:shared]) == list(keys[:shared]):
                 found, first = shared, number
         lines = enumerate(self.text.splitlines()[first - 1 :], first) if first and element else ()
-        return next((number for number, line in lines if _quotes(line, element)), first)
-
-
-def _quotes(line: str, element: str) -> bool:
-    """Whether a line has an element of a list."""
-    return f'"{element}"' in line or f"'{element}'" in line
+        quoted = f'"{element}"', f"'{element}'"
+        return next((number for number, line in lines if any(q in line for q in quoted)), first)
 
 
 def _paths(text: str) -> Iterator[tuple[int, tuple[str, ...]]]:

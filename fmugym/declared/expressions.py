@@ -22,6 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from fmugym.checks import float_or_nan
 from fmugym.declared.computed import Value, where
 from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.declared.mistakes import ConsequenceError
@@ -115,9 +116,8 @@ class Expression:
     @property
     def names(self) -> set[str]:
         """The names that it reads."""
-        called = {id(node.func) for node in ast.walk(self.tree) if isinstance(node, ast.Call)}
-        nodes = [node for node in ast.walk(self.tree) if isinstance(node, ast.Name)]
-        return {node.id for node in nodes if id(node) not in called}
+        found = {node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name)}
+        return found - FUNCTIONS.keys() - {"previous"}
 
     @property
     def previous_names(self) -> set[str]:
@@ -188,7 +188,8 @@ def _check_size(text: str, tree: ast.expr) -> None:
     count, level = 0, [tree]
     for _ in range(_DEEPEST):
         count += len(level)
-        level = [child for node in level for child in _operands(node)]
+        parts = (child for node in level for child in ast.iter_child_nodes(node))
+        level = [child for child in parts if isinstance(child, ast.expr)]
         if not level:
             break
     if level or count > _MOST_NODES:
@@ -196,10 +197,6 @@ def _check_size(text: str, tree: ast.expr) -> None:
             f"{shown(text)} is too long: an expression has at most {_MOST_NODES} parts, nested "
             f"{_DEEPEST} times"
         )
-
-
-def _operands(node: ast.AST) -> list[Any]:
-    return [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
 
 
 class _Evaluation:
@@ -252,28 +249,22 @@ class _Evaluation:
         return ConfigError(f"{text} (column {_column(self._text, offset)} of {shown(self._text)})")
 
     def _value_of_constant(self, node: ast.Constant) -> Value:
-        value = node.value
-        if isinstance(value, bool):
-            return self._constant(value)
-        if isinstance(value, int | float):
-            number = _as_float(value)
-            if math.isfinite(number):
-                return self._constant(number)
-        raise self._error(node, f"{shown(value)} is no number")
+        value = node.value if isinstance(node.value, bool) else float_or_nan(node.value)
+        if not math.isfinite(value):
+            raise self._error(node, f"{shown(node.value)} is no number")
+        return self._constant(value)
 
     def _value_of_name(self, node: ast.Name) -> Value:
         if node.id in CONSTANTS:
             return self._constant(CONSTANTS[node.id])
         value = self._names.find(node.id)
         if value is None:
-            raise self._error(node, unknown_name("name", node.id, self._known()))
+            known = [*self._names.known(), *CONSTANTS]
+            raise self._error(node, unknown_name("name", node.id, known))
         return value
 
     def _constant(self, number: float | bool) -> Value:
         return Value.of(self._names.graph, number)
-
-    def _known(self) -> list[str]:
-        return list(dict.fromkeys([*self._names.known(), *CONSTANTS]))
 
     def _value_of_unaryop(self, node: ast.UnaryOp) -> Value:
         operand = self.evaluate(node.operand)
@@ -359,10 +350,3 @@ class _Evaluation:
 def _applied(sign: ast.AST, *operands: Value) -> Value:
     value: Value = _OPERATIONS[type(sign)](*operands)
     return value
-
-
-def _as_float(value: float) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf

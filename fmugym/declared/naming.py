@@ -104,21 +104,21 @@ class Naming:
         observed = declared.measured
         previous = sorted(set().union(*(e.previous_names for e in expressions)))
         used = sorted(set().union(*(e.names for e in expressions)))
-        wanted = dict.fromkeys(filter(declared.is_output, observed + previous))
-        others = [name for name in used if declared.is_output(name) and name not in wanted]
-        self._places = self._find_places([*wanted, *others])
-        wanted = {name: None for name in wanted if self._is_first(name)}
-        others = [name for name in others if self._is_first(name)]
-        if not wanted and not others:
+        wanted = set(observed + previous)
+        names = filter(declared.is_output, dict.fromkeys([*observed, *previous, *used]))
+        self._places = self._find_places(list(names))
+        outputs = [name for name in self._firsts if name in wanted]
+        if not self._firsts:
             text = "the task reads no variable of the FMU"
             is_known = declared.root.mistakes.explain(())  # by any mistake
             raise ConsequenceError(text) if is_known else declared.agent("observations").error(text)
-        return (list(wanted), others) if wanted else (others, [])
+        return (outputs, self._firsts[len(outputs) :]) if outputs else (self._firsts, [])
 
     def _find_places(self, names: list[str]) -> dict[str, int]:
         """Where the values of names are: several may stand for one variable of the FMU.
 
-        They must be sampled in one way: a step gives one value of each.
+        ``_firsts`` are the names that come first for their variables. Several must be sampled in
+        one way: a step gives one value of each.
         """
         variables, first = self.declared.variables, dict[str, str]()
         originals: dict[str, Variable] = {}
@@ -133,13 +133,8 @@ class Naming:
                 entry = variables[name].entry
                 text = f"{known!r} and {name!r} are both {original.name!r} of the FMU, which has "
                 entry.note(entry.error(f"{text}one 'sample' only"))
-        order = list(first.values())
-        return {name: order.index(first[one.name]) for name, one in originals.items()}
-
-    def _is_first(self, name: str) -> bool:
-        """Whether a name stands for a variable of the FMU, and none before for the same one."""
-        place = self._places.get(name)
-        return name == next((n for n, p in self._places.items() if p == place), None)
+        self._firsts = list(first.values())
+        return {name: self._firsts.index(first[one.name]) for name, one in originals.items()}
 
     @property
     def read_names(self) -> list[str]:
@@ -153,7 +148,7 @@ class Naming:
     def channel_of(self, name: str) -> int:
         """The number of the sensor of a value, from which its noise follows."""
         place = self._places[name]
-        aliases = [n for n in self._places if not self._is_first(n)]
+        aliases = [n for n in self._places if n not in self._firsts]
         return place if name not in aliases else len(self.outputs) + aliases.index(name)
 
     def read(self, attribute: str, *keys: str | int, dtype: npt.DTypeLike = np.float64) -> Value:
@@ -209,7 +204,7 @@ class Naming:
     def _known(self) -> list[str]:
         declared = self.declared
         own = [*declared.own_names, *declared.parameters, *BUILT_IN]
-        return list(dict.fromkeys([*own, *declared.variables.names()]))
+        return [*own, *declared.variables.names()]
 
     def value_of(self, name: str, moment: Moment) -> Value | None:
         """The value of a name; None if there is no such name, or it has none at this moment."""

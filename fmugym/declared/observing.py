@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.declared.computed import Value, where
+from fmugym.declared.computed import Value, function_of, where
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
@@ -373,30 +373,21 @@ def scaled(seen: Seen) -> Seen:
     return seen._replace(value=(seen.value - middle) / half, low=-1.0, high=1.0)
 
 
-def remember(
-    kept: list[History],
-    values: Callable[[Any], Any],
-    fills: Callable[[Any], Any],
-    first_step: int = 1,
-) -> Callable[[Any], None]:
+def remember(kept: list[History], first_step: int) -> Callable[[Any], None]:
     """Make a function of the environment that adds the latest values to histories.
 
     Args:
         kept: The histories.
-        values: Gives the values to add.
-        fills: Gives the other values in the first step.
         first_step: The step count after the first step; negative if there is a warm-up.
     """
     names = [history.variable for history in kept]
+    values = function_of([history.now for history in kept])
+    fills = function_of([history.fill for history in kept])
 
     def update(env: Any) -> None:
         is_first, variables = env.step_count == first_step, env.variables
         for name, value, fill in zip(names, values(env), fills(env), strict=True):
-            variables[name] = _pushed(variables[name], value, fill, is_first)
+            before = np.where(is_first, np.asarray(fill)[np.newaxis], variables[name])
+            variables[name] = np.concatenate([np.asarray(value)[np.newaxis], before[:-1]])
 
     return update
-
-
-def _pushed(past: Any, value: Any, fill: Any, is_first: Any) -> Any:
-    before = np.where(is_first, np.asarray(fill)[np.newaxis], past)
-    return np.concatenate([np.asarray(value)[np.newaxis], before[:-1]])

@@ -66,7 +66,9 @@ class Pilot:
         self.variable, self.controller, self._declared = variable, controller, naming.declared
         self.place = naming.declared.actions.index(variable)
         self._names = tuple(signals_of(controller))
-        self.values = [_signal(naming, name) for name in self._names]
+        entry = naming.declared.warm_up.entry.child("controller")
+        measured = map(Expression.parse, self._names)
+        self.values = [naming.value(entry, one, Moment.SEEN).number for one in measured]
         self._signals, self._clock = function_of(self.values), function_of(naming.clock)
         self._present = function_of(naming.present(variable)) if variable.delta else None
 
@@ -199,8 +201,3 @@ class DeclaredWarmUp(WarmUp):
                     f"{shown(value)}: nearly every episode needs a state of its own. Leave out "
                     "'cache', or draw from a list of values"
                 )
-
-
-def _signal(naming: Naming, name: str) -> Value:
-    entry = naming.declared.warm_up.entry.child("controller")
-    return naming.value(entry, Expression.parse(name), Moment.SEEN).number

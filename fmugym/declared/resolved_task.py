@@ -30,7 +30,6 @@ from fmugym.declared.mathematics import minimum
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
 from fmugym.declared.observing import (
-    History,
     NoiseKey,
     Seen,
     has_errors,
@@ -102,7 +101,8 @@ class ResolvedTask:
             warm_steps = self._steps_of_warm_up(time_step)
         with root.noting():
             self._naming = Naming(declared, time_step, warm_steps)
-            self._read_observations()
+            self._kept = histories(self._naming)
+            self._seen, self._sensors = observed_values(self._naming, self._kept)
             self._find_mistakes()
         root.mistakes.require_none()
         with root.noting():
@@ -142,10 +142,6 @@ class ResolvedTask:
         found = named_values(self._naming)
         read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
-
-    def _read_observations(self) -> None:
-        self._kept = histories(self._naming)
-        self._seen, self._sensors = observed_values(self._naming, self._kept)
 
     def _find_mistakes(self) -> None:
         """Evaluate everything once, so that one error tells all mistakes."""
@@ -273,10 +269,12 @@ class ResolvedTask:
         actions, seen = self._action_space(), self._observation_space()
         if actions is not None:
             hooks["_get_action_space"] = lambda env: actions
-            hooks["_get_inputs"] = self._inputs()
+            values = self._input_values()
+            hooks["_get_inputs"] = function_of(values[0] if len(values) == 1 else values)
         if seen is not None:
             hooks["_get_observation_space"] = lambda env: seen
-            hooks["_get_observation"] = self._observation()
+            observe = function_of([one.value for one in self._normalized])
+            hooks["_get_observation"] = lambda env: np.array(observe(env), dtype=np.float32)
         return hooks
 
     def _action_space(self) -> spaces.Space[Any] | None:
@@ -294,11 +292,6 @@ class ResolvedTask:
             return _box([(-1.0, 1.0) if rescales else one.chosen for one in variables])
         counts = [len(variable.levels) for variable in variables]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
-
-    def _inputs(self) -> Hook:
-        """Write the FMU's inputs, in their units."""
-        values = self._input_values()
-        return function_of(values[0] if len(values) == 1 else values)
 
     def _input_values(self, acting: Collection[str] | None = None) -> list[Value]:
         """The FMU's inputs, in their units.
@@ -361,10 +354,6 @@ class ResolvedTask:
                 return normalized(seen, self._declared.nominal_of(seen.name))
         return seen
 
-    def _observation(self) -> Hook:
-        values = function_of([seen.value for seen in self._normalized])
-        return lambda env: np.array(values(env), dtype=np.float32)
-
     # What follows a step.
 
     def _hooks_of_steps(self) -> dict[str, Hook]:
@@ -393,12 +382,8 @@ class ResolvedTask:
 
     def _updates_of_histories(self) -> list[Hook]:
         """The sensors follow what they measure."""
-        return [self._remembering(kept) for kept in (self._kept, self._sensors) if kept]
-
-    def _remembering(self, kept: list[History]) -> Hook:
-        values = function_of([history.now for history in kept])
-        fills = function_of([history.fill for history in kept])
-        return remember(kept, values, fills, self._naming.first_step)
+        first = self._naming.first_step
+        return [remember(kept, first) for kept in (self._kept, self._sensors) if kept]
 
     def _switched(self) -> dict[str, Value]:
         """What the task remembers of actions with a least time on or off, by variables."""

@@ -8,9 +8,9 @@ from typing import Any, Final, NamedTuple
 
 from fmugym.declared.entries import Entry
 from fmugym.distributions import Choice
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import unknown_name
 
-__all__ = ["Scenario", "held_out_times", "read_begin", "read_scenarios", "scenario_of"]
+__all__ = ["Scenario", "held_out_times", "read_begin", "read_scenarios"]
 
 _YEAR: Final = 365 * 86400.0
 _MOST_STARTS: Final = 10_000
@@ -112,14 +112,3 @@ def held_out_times(root: Entry) -> list[Scenario]:
         if length < _YEAR:
             found.append(Scenario(season["from"] + length, _YEAR - length))
     return found
-
-
-def scenario_of(scenarios: Mapping[str, Scenario], name: str) -> Scenario:
-    """Find a scenario by its name.
-
-    Raises:
-        ConfigError: If there is none of this name, with the nearest one.
-    """
-    if name not in scenarios:
-        raise ConfigError(unknown_name("scenario", name, scenarios))
-    return scenarios[name]

@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from fmugym.checks import check_mapping, check_path, require_regular
 from fmugym.config import FOREIGN
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.format import TASK, VERSION
-from fmugym.declared.seasons import read_scenarios, scenario_of
+from fmugym.declared.seasons import read_scenarios
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -192,8 +192,8 @@ class Task:
         scenarios = read_scenarios(section)
         if name not in scenarios:
             root.mistakes.require_none()
-        with section.placing():
-            scenario = scenario_of(scenarios, name)
+            raise section.error(unknown_name("scenario", name, scenarios))
+        scenario = scenarios[name]
         times = {"clock": scenario.start, "episode_length": scenario.length}
         if "start_time" in self.document and "clock" not in self.document:
             times["start_time"] = scenario.start_after(
@@ -232,7 +232,7 @@ class Task:
             FileExistsError: If the file exists.
         """
         file = check_path("the path of a task", path).absolute()
-        document = _relative(dict(self.document), file.parent)
+        document = self.with_paths(partial(_relative_path, folder=file.parent))
         own = self.sources[0]
         if "version" not in document and (own.path is None or "version" in own.document):
             document = {"version": VERSION, **document}
@@ -295,16 +295,12 @@ def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in own.items():
         before = merged.get(key)
-        if isinstance(value, dict) and isinstance(before, dict) and _is_mergeable(value):
-            merged[key] = _merge(before, value)
-        else:
-            merged[key] = value
+        merged[key] = value
+        if isinstance(value, dict) and isinstance(before, dict):
+            # A distribution or an FMU is one value.
+            is_one_value = "distribution" in value or "bundled" in value
+            merged[key] = value if is_one_value else _merge(before, value)
     return merged
-
-
-def _is_mergeable(value: Mapping[str, Any]) -> bool:
-    """Whether a table is a collection; a distribution or an FMU is one value."""
-    return "distribution" not in value and "bundled" not in value
 
 
 def _plain(value: Any) -> Any:
@@ -346,10 +342,6 @@ def _with_paths(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     return dict(
         with_paths(TASK, document, lambda path: os.path.normpath(folder / Path(path).expanduser()))
     )
-
-
-def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
-    return dict(with_paths(TASK, document, lambda path: _relative_path(path, folder)))
 
 
 def _relative_path(path: str, folder: Path) -> str:

@@ -132,8 +132,7 @@ class TaskVariables:
 
     def names(self) -> list[str]:
         """The aliases, and the names of the FMU's variables."""
-        known = [*self._entries, *self._variables, *self._description.variables]
-        return list(dict.fromkeys(known))
+        return [*self._entries, *self._variables, *self._description.variables]
 
     def names_in_fmu(self, aliases: Sequence[str]) -> list[str]:
         """The FMU's names of variables."""

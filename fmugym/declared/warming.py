@@ -69,7 +69,7 @@ def read_warm_up(
             variable = _action_of(one, name, actions)
             controllers[name] = (
                 _thermostat(one, variable, controlled)
-                if _is_bare_thermostat(one, known)
+                if one.value in THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
     return WarmUpTable(
@@ -89,10 +89,6 @@ def _named_controllers(root: Entry) -> dict[str, Entry]:
             else:
                 _controller(one, {})
     return known
-
-
-def _is_bare_thermostat(entry: Entry, known: Mapping[str, Entry]) -> bool:
-    return entry.value in THERMOSTATS and entry.value not in known
 
 
 def _thermostat(

@@ -33,12 +33,8 @@ def as_toml(document: Mapping[str, Any]) -> str:
     import tomlkit
 
     written = tomlkit.document()
-    tables = {k: v for k, v in document.items() if isinstance(v, Mapping) and k not in _INLINE}
-    for key, value in document.items():
-        if key not in tables:
-            written.add(key, _item(value, (key,)))
-    for key, items in tables.items():
-        written.add(key, _table(items, (key,)))
+    for key in sorted(document, key=lambda key: _has_heading(document[key], (key,))):
+        written.add(key, _new(document[key], (key,)))
     return str(tomlkit.dumps(written))
 
 
@@ -94,10 +90,12 @@ def _revise(table: MutableMapping[str, Any], wanted: Mapping[str, Any], keys: Ke
 
 
 def _new(value: Any, keys: Keys) -> Any:
-    """A value for a document that has other values already."""
-    if len(keys) > 1 or not isinstance(value, Mapping) or keys[0] in _INLINE:
-        return _item(value, keys)
-    return _table(value, keys)
+    return _table(value, keys) if _has_heading(value, keys) else _item(value, keys)
+
+
+def _has_heading(value: Any, keys: Keys) -> bool:
+    """Whether a value is a table with a heading."""
+    return isinstance(value, Mapping) and len(keys) == 1 and keys[0] not in _INLINE
 
 
 def _same(first: Any, second: Any) -> bool:
