@@ -80,16 +80,9 @@ class Report:
 
     def as_dict(self) -> dict[str, Any]:
         """The report in types that JSON has."""
-        return {
-            "schema": 1,
-            "verdict": self.verdict,
-            "findings": [asdict(finding) for finding in self.findings],
-            "costs": dict(self.costs),
-            "hooks": self.hooks,
-            "reset_method": self.reset_method,
-            "recommended": dict(self.recommended),
-            "lines": [asdict(one) | {"line": one.line} for one in self.advices],
-        }
+        facts = {"verdict": self.verdict, **asdict(self)}
+        lines = zip(facts.pop("advices"), self.advices, strict=True)
+        return facts | {"lines": [one | {"line": advice.line} for one, advice in lines]}
 
     def as_text(self) -> str:
         """The report in lines of printable ASCII."""

@@ -10,7 +10,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -92,7 +92,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
     try:
         env.action_space.seed(0)
         first = _play(env, env.action_space.sample)
-        findings = tuple(_findings(env, first))
+        findings = [*_findings(env, first)]
         costs = {
             "step": first.step_time,
             "reset": _play(env, None).reset_time,
@@ -100,41 +100,33 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         }
         hooks = _hooks(make_env)
         recommended = _recommended(env, first.step_time, hooks, findings)
-        reset_method, replay = env.reset_method, Replay.of(env)
+        others = [*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards)]
+        replay = Replay.of(env)
         steps = None if first.terminated else env.config.max_episode_steps
-        others = (*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards))
     finally:
         env.close()
-    report = Report(findings, costs, hooks, reset_method, recommended, others)
-    return _advised(report, replay, steps)
-
-
-def _advised(report: Report, replay: Replay, steps: int | None) -> Report:
-    """Add what repetitions of an episode tell."""
-    found = list(advise(replay))
-    known = {one.key for one in found if isinstance(one, Advice)}
-    if steps is not None:
-        found += (one for one in advise_episodes(replay, steps) if one.key not in known)
-    advices = (*(one for one in found if isinstance(one, Advice)), *report.advices)
-    short = (one for one in advices if one.key == "episode_length")
-    findings = [
-        *(one for one in found if isinstance(one, Finding)),
-        *(Finding("warning", "length", one.why, f"give {one.line}") for one in short),
-    ]
-    new = {one.check for one in findings}
-    before = (one for one in report.findings if one.verdict != "ok" or one.check not in new)
-    return replace(
-        report,
-        findings=(*before, *findings),
-        recommended={**report.recommended, **{one.key: one.value for one in advices}},
-        advices=advices,
+    more, advices = _repeated(replay, steps)
+    advices += others
+    checks = {one.check for one in more}
+    before = (one for one in findings if one.verdict != "ok" or one.check not in checks)
+    recommended |= {one.key: one.value for one in advices}
+    return Report(
+        (*before, *more), costs, hooks, recommended["reset_method"], recommended, tuple(advices)
     )
 
 
-def _isolates(env: FMUEnv) -> bool:
-    """Whether the FMU needs worker processes."""
-    verdict = known_verdict(env.fmu)
-    return verdict is not None and verdict.isolate
+def _repeated(replay: Replay, steps: int | None) -> tuple[list[Finding], list[Advice]]:
+    """What repetitions of an episode tell."""
+    found = list(advise(replay))
+    findings = [one for one in found if isinstance(one, Finding)]
+    advices = [one for one in found if isinstance(one, Advice)]
+    known = {one.key for one in advices}
+    for one in () if steps is None else advise_episodes(replay, steps):
+        if one.key not in known:
+            advices.append(one)
+            if one.key == "episode_length":
+                findings.append(Finding("warning", "length", one.why, f"give {one.line}"))
+    return findings, advices
 
 
 def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advice]:
@@ -147,7 +139,8 @@ def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advi
         if not _EXPLORED[0] <= size <= _EXPLORED[1]:
             why = f"actions reach {size:.3g}, which algorithms of other libraries do not expect"
             yield Advice("agent", "rescale", True, why)
-    if "isolation" in recommended:
+    verdict = known_verdict(env.fmu)
+    if verdict is not None and verdict.isolate:
         yield Advice("config", "isolation", "process", "instances disturb each other, or crash")
 
 
@@ -171,17 +164,15 @@ def _restore_time(env: FMUEnv) -> float | None:
 
 
 def _recommended(
-    env: FMUEnv, step_time: float, hooks: str, findings: tuple[Finding, ...]
+    env: FMUEnv, step_time: float, hooks: str, findings: Sequence[Finding]
 ) -> dict[str, Any]:
     """Settings that suit what was measured."""
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = {"reset_method": env.reset_method}
     if hooks != "none":
         settings["envs"] = next((n for most, n in _ENVS if step_time < most), _FEWEST_ENVS)
     if any(finding.text.startswith(_UNEVEN) for finding in findings):
         settings["normalize"] = True
-    if _isolates(env):
-        settings["isolation"] = "process"
-    return settings | {"reset_method": env.reset_method}
+    return settings
 
 
 def _play(
@@ -281,25 +272,30 @@ def _is_simple(space: spaces.Space[Any]) -> bool:
     return isinstance(space, kinds)
 
 
+def _ends(space: Any) -> tuple[Any, Any]:
+    """The lowest and the highest action, as arrays."""
+    if isinstance(space, spaces.Box):
+        return space.low, space.high
+    low = np.full(space.shape, getattr(space, "start", 0), space.dtype)
+    counts = getattr(space, "n" if isinstance(space, spaces.Discrete) else "nvec", 2)
+    return low, np.asarray(low + counts - 1, space.dtype)
+
+
+def _middle(space: Any) -> Any:
+    if not _is_simple(space):
+        return space.sample()
+    low, high = _ends(space)
+    return ((low.astype(np.float64) + high) / 2).astype(space.dtype)[()]
+
+
 def _extremes(space: Any, names: tuple[str, ...]) -> Iterator[tuple[str, Any, Any]]:
     """For each element of an action, a name and actions that differ in this element only."""
-    if isinstance(space, spaces.Discrete):
-        yield "the action", space.start, space.start + space.n - 1
-        return
-    if not _is_simple(space):
-        return
-    if isinstance(space, spaces.Box):
-        low, high = space.low, space.high
-    else:
-        counts = np.asarray(space.nvec if isinstance(space, spaces.MultiDiscrete) else 2)
-        low = np.zeros(space.shape, space.dtype)
-        high = np.broadcast_to(counts - 1, space.shape).astype(space.dtype)
-    middle = ((low.astype(np.float64) + high) / 2).astype(space.dtype)
+    low, high = _ends(space) if _is_simple(space) else (np.empty(0),) * 2
     for index, place in enumerate(np.ndindex(low.shape)):
-        first, second = middle.copy(), middle.copy()
+        first, second = np.array(_middle(space)), np.array(_middle(space))
         first[place], second[place] = low[place], high[place]
         name = names[index] if len(names) == low.size else f"element {index}"
-        yield name, first, second
+        yield name if low.ndim else "the action", first[()], second[()]
 
 
 def _always(action: Any) -> Callable[[], Any]:
@@ -388,14 +384,6 @@ def _constants(space: Any) -> Iterator[Any]:
     yield from (first for _, first, _ in itertools.islice(_extremes(space, ()), 1))
 
 
-def _middle(space: Any) -> Any:
-    for _, first, second in _extremes(space, ()):
-        both = np.asarray(first, np.float64) + np.asarray(second, np.float64)
-        middle = (both / 2).astype(space.dtype)
-        return int(middle) if isinstance(space, spaces.Discrete) else middle
-    return space.sample()
-
-
 def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
     rewards = first.rewards
     low, high = rewards.min(), rewards.max()
@@ -429,12 +417,17 @@ def _factor_of(rewards: FloatArray) -> float:
 
 def _advice_of_reward(env: FMUEnv, rewards: FloatArray) -> Iterator[Advice]:
     """The line with larger rewards."""
-    task, factor, low = getattr(env, "task", None), _factor_of(rewards), rewards.min()
-    given = task.document.get("reward") if isinstance(task, Task) else None
+    given, factor, low = _document(env).get("reward"), _factor_of(rewards), rewards.min()
     if factor and isinstance(given, str):
         offset = "" if abs(low) < _TINY else f" {'+' if low < 0 else '-'} {abs(low):.17g}"
         why = f"rewards differ by {np.ptp(rewards):.2g}, which algorithms take for noise"
         yield Advice("", "reward", f"{factor:g} * ({given}{offset})", why)
+
+
+def _document(env: FMUEnv) -> Mapping[str, Any]:
+    """What the task of an environment declares; nothing for a class without one."""
+    task = getattr(env, "task", None)
+    return task.document if isinstance(task, Task) else {}
 
 
 def _of_observations(env: FMUEnv, first: _Episode, second: _Episode) -> Iterator[Finding]:
@@ -452,9 +445,7 @@ def _of_observations(env: FMUEnv, first: _Episode, second: _Episode) -> Iterator
 
 def _is_normalized(env: FMUEnv) -> bool:
     """Whether a task maps what the agent observes from its limits to -1 to 1."""
-    task = getattr(env, "task", None)
-    way = task.root.child("agent").child("normalize").value if isinstance(task, Task) else None
-    return way in (True, "limits")
+    return _document(env).get("agent", {}).get("normalize") in (True, "limits")
 
 
 def _of_limits(
@@ -504,9 +495,7 @@ def _of_still(env: FMUEnv, names: tuple[str, ...], seen: Any) -> Iterator[Findin
 
 def _own_name(env: FMUEnv, name: str) -> str:
     """What the FMU calls a variable that has a name in the task."""
-    task = getattr(env, "task", None)
-    given = task.document.get("variables", {}) if isinstance(task, Task) else {}
-    return str(given.get(name, {}).get("name", name))
+    return str(_document(env).get("variables", {}).get(name, {}).get("name", name))
 
 
 def _of_length(env: FMUEnv) -> Finding:
