@@ -21,6 +21,7 @@ from fmugym.tools.options import (
     note,
     require_toml,
     say_result,
+    shown_in_any_case,
     tell,
     write_extension,
 )
@@ -61,15 +62,8 @@ def _tune(arguments: argparse.Namespace) -> None:
         _require_name(arguments.name)
         require_toml(output)
     found: list[Tuning] = []
-    try:
+    with shown_in_any_case(lambda: _show(search, found, arguments)):
         _search(search, arguments, found)
-    except KeyboardInterrupt:
-        if not found:
-            note("interrupted before the first round was over; nothing is found")
-            raise
-        _show(search, found[-1], arguments)
-        raise
-    _show(search, found[-1], arguments)
 
 
 def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
@@ -98,8 +92,12 @@ def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) 
         )
 
 
-def _show(search: Search, best: Tuning, arguments: argparse.Namespace) -> None:
-    text, output = search.text(best.parameters), arguments.output
+def _show(search: Search, found: list[Tuning], arguments: argparse.Namespace) -> None:
+    if not found:
+        note("interrupted before the first round was over; nothing is found")
+        return
+    best, output = found[-1], arguments.output
+    text = search.text(best.parameters)
     if output is not None:
         write_extension(output, arguments.task, {"controllers": {arguments.name: text}})
     for name in search.at_an_end(best.parameters):
