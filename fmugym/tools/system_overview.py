@@ -10,9 +10,9 @@ from typing import Any
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.task_fmu import fmu_of
-from fmugym.errors import ConfigError, plain
+from fmugym.errors import plain
 from fmugym.systems import FMUSystem
-from fmugym.tools.overview import overview, tables
+from fmugym.tools.overview import headed, overview, tables
 
 __all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"]
 
@@ -28,17 +28,7 @@ def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
         ConfigError: If the task file or the system has a mistake.
         FMULoadError: If the archive or an FMU cannot be read.
     """
-    if path.suffix.lower() == ".ssp":
-        return FMUSystem.read(path, master=master)
-    if path.suffix.lower() == ".toml":
-        return _model_of(Task.read(path), master)
-    if master is not None:
-        raise ConfigError(f"a master is for systems; {path.name} is a single FMU")
-    return FMU(path)
-
-
-def _model_of(task: Task, master: str | None) -> FMU | FMUSystem:
-    """The system that a task file names, or the FMU with the libraries of the task."""
+    task = Task.read(path) if path.suffix.lower() == ".toml" else Task.from_dict({"fmu": path})
     source = fmu_of(task, master)
     if isinstance(source, FMUSystem):
         return source
@@ -113,27 +103,23 @@ def as_text_of_system(facts: Mapping[str, Any]) -> str:
     Returns:
         Lines of printable ASCII.
     """
-    return "\n".join([*_heading(facts), *_parts(facts["system"]), *tables(facts)])
+    kind = f"a system of {len(facts['system']['components'])} FMUs"
+    return "\n".join([*headed(facts, kind, _rows(facts)), *_parts(facts["system"]), *tables(facts)])
 
 
-def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
-    yield plain(f"{facts['model_name']} (a system of {len(facts['system']['components'])} FMUs)")
-    if facts["description"]:
-        yield plain(facts["description"])
+def _rows(facts: Mapping[str, Any]) -> dict[str, str]:
     times = facts["default_experiment"]
     step = times["step_size"]
     obstacles = "; ".join(facts["obstacles"])
     isolated = any(one["isolate"] for one in facts["system"]["components"])
     how = "runs here, in worker processes" if isolated else "runs here"
-    rows = {
+    return {
         "file": facts["path"],
         "this machine": f"does NOT run here: {obstacles}" if obstacles else how,
         "step": "not given" if step is None else f"{step:g} s",
         "master": facts["system"]["master"],
         "order": " -> ".join(map(_group, facts["system"]["order"])),
     }
-    for name, value in rows.items():
-        yield f"  {name:<20}{plain(value)}"
 
 
 def _group(group: Mapping[str, Any]) -> str:
