@@ -89,12 +89,10 @@ def scenarios_of(target: str) -> list[str]:
     """
     path = Path(target)
     if path.is_file() and path.suffix.lower() not in _MODELS:
-        return _scenarios(Task.read(path))
-    with closing(maker_of(target)()) as env:
-        return _scenarios(getattr(env, "task", None))
-
-
-def _scenarios(task: Task | None) -> list[str]:
+        task: Task | None = Task.read(path)
+    else:
+        with closing(maker_of(target)()) as env:
+            task = getattr(env, "task", None)
     return [] if task is None else list(task.document.get("scenarios", {}))
 
 
