@@ -40,13 +40,9 @@ def _quantities(naming: Naming) -> Iterator[Quantity]:
     targets = _targets(declared)
     for name in setpoints:
         yield _of_name(declared, name, "setpoint", targets.get(name, ""))
-    for name in declared.series:
-        if name not in setpoints:
-            yield _of_name(declared, name, "data")
-    for name in declared.root.child("memory").value or {}:
-        yield _of_name(declared, name, "memory")
-    for name in declared.root.child("expressions").value or {}:
-        yield _of_name(declared, name, "expression")
+    for kind in ("data", "memory", "expressions"):
+        for name in declared.root.child(kind).value or {}:
+            yield _of_name(declared, name, kind.removesuffix("s"))
     for alias in declared.inputs:
         yield _of_variable(declared, alias, "input")
     for alias in declared.parameters:

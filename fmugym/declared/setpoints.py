@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
-from fmugym.declared.format import RAMP, SETPOINT, SINE
+from fmugym.declared.format import RAMP, SETPOINT, SINE, STEPS
 from fmugym.declared.parts import Derived, Limits, Memory, read_limits
 from fmugym.declared.series import Series, read_schedule
 
@@ -97,7 +97,9 @@ class SetPoints:
             case "schedule":
                 self.series[entry.name] = read_schedule(entry)
             case "steps":
-                self.steps[entry.name] = _steps(entry, len(self.steps))
+                steps, channel = entry.child("steps"), _CHANNELS_OF_STEPS + len(self.steps)
+                low, high, every = (steps.required(key).value for key in STEPS.keys)
+                self.steps[entry.name] = Steps(entry, (low, high), every, channel)
             case "data":
                 with entry.child("data").placing():
                     name = Expression.parse(entry.value["data"])
@@ -115,9 +117,3 @@ class SetPoints:
             self.memory[names[key]] = Memory(entry, one.value, None, _UNLIMITED)
         expression = Expression.parse(formula.format(**names))
         self.derived[entry.name] = Derived(entry, expression, read_limits(entry))
-
-
-def _steps(entry: Entry, number_of_steps: int) -> Steps:
-    steps = entry.child("steps")
-    low, high, every = (steps.required(key).value for key in ("low", "high", "every"))
-    return Steps(entry, (low, high), every, _CHANNELS_OF_STEPS + number_of_steps)

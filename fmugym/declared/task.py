@@ -264,15 +264,12 @@ def _read(path: Path) -> Source:
     try:
         document = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        hint = "; texts and expressions stand in quotes" if _lacks_quotes(error) else ""
+        lacks_quotes = re.search("Invalid value|Expected newline", str(error))
+        hint = "; texts and expressions stand in quotes" if lacks_quotes else ""
         raise ConfigError(f"{path.name} is no TOML file: {reason(error)}{hint}") from None
     source = Source(path, path.parent, text, _with_paths(_grouped(_plain(document)), path.parent))
     _check(source)
     return source
-
-
-def _lacks_quotes(error: Exception) -> bool:
-    return any(told in str(error) for told in ("Invalid value", "Expected newline"))
 
 
 def _advice(path: Path) -> str:

@@ -172,15 +172,10 @@ _known: Final[dict[Any, FMUSystem]] = {}
 def _component(entry: Entry) -> Component:
     fmu = entry if entry.child("fmu").value is None else entry.child("fmu")
     own = {name: entry.value[name] for name in table_of(Component).keys if name in entry.value}
+    path = _path(fmu)
+    _status(fmu, path)
     with entry.placing():
-        return Component(**{**own, "fmu": _found(fmu)})
-
-
-def _found(entry: Entry) -> Path:
-    """The path of the FMU of a component, which must exist."""
-    path = _path(entry)
-    _status(entry, path)
-    return path
+        return Component(**{**own, "fmu": path})
 
 
 def _version(component: Component) -> tuple[str, int, int]:

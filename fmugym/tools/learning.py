@@ -242,12 +242,10 @@ def _tell_what_is_kept(folder: Path, state: str) -> None:
 def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
     """The settings that the options make, together with what a training was begun with."""
     before = facts_of(arguments.output) if arguments.resume else {}
-    given = {name: getattr(arguments, name) for name in _DEFAULTS}
     for name, default in _DEFAULTS.items():
-        if given[name] is None:
-            given[name] = before.get(name, default)
-    options = argparse.Namespace(**given)
-    check_numbers(options, "steps", "envs", "episodes")
+        if getattr(arguments, name) is None:
+            setattr(arguments, name, before.get(name, default))
+    check_numbers(arguments, "steps", "envs", "episodes")
     own = arguments_of(arguments.arguments) or before.get("arguments", {})
     names, master = scenarios_of(arguments.task), arguments.master
     make_env = maker_of(arguments.task, master=master)
@@ -256,12 +254,12 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
         make_env,
         held_out or {"held-out seeds": make_env},
         arguments.output,
-        options.algorithm,
-        options.steps,
-        options.envs,
-        options.seed,
-        options.episodes,
-        normalize=options.normalize,
+        arguments.algorithm,
+        arguments.steps,
+        arguments.envs,
+        arguments.seed,
+        arguments.episodes,
+        normalize=arguments.normalize,
         arguments=own,
         diary=_diary_of(arguments, before.get("record")),
     )

@@ -107,15 +107,11 @@ def _table(errors: Sequence[Error]) -> list[str]:
     lines = []
     for name in dict.fromkeys(one.name for one in errors):
         own = [one for one in errors if one.name == name]
-        chosen = [own[place - 1] for place in _doubling(len(own))]
+        powers = (2**power for power in range(len(own).bit_length()))
+        chosen = [own[place - 1] for place in powers if place < len(own)] + own[-1:]
         cells = [f"{one.rms:.3g} ({one.bias:+.2g}) {one.ahead:g} s ahead" for one in chosen]
         lines.append(f"error of {name}, root mean square (and mean): {', '.join(cells)}")
     return lines
-
-
-def _doubling(count: int) -> list[int]:
-    powers = [2**power for power in range(count.bit_length()) if 2**power < count]
-    return [*powers, count]
 
 
 def add_serve(commands: Commands) -> None:
@@ -154,11 +150,8 @@ def _serve(arguments: argparse.Namespace) -> None:
             text += f"\nadd this to the task:\n\n{as_toml({'plant': plant})}"
         say_result(arguments, {"address": server.address, "plant": plant}, text)
         sys.stdout.flush()  # a program may wait for the address
-        with shown_in_any_case(lambda: _tell(arguments, server)):
+        with shown_in_any_case(
+            lambda: None if arguments.json else say(plain(server.summary().as_text()))
+        ):
             while not server.wait(0.2):
                 pass
-
-
-def _tell(arguments: argparse.Namespace, server: Server) -> None:
-    if not arguments.json:
-        say(plain(server.summary().as_text()))

@@ -208,14 +208,12 @@ def add_bench(commands: Commands) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    report: Report | None = None
-    with shown_in_any_case(lambda: _show_speeds(report, arguments)):
+    reports: list[Report] = []
+
+    def show() -> None:
+        for last in reports[-1:]:  # which has the speeds of those before
+            say_result(arguments, last.as_dict(), speed_table(last))
+
+    with shown_in_any_case(show):
         make = maker_of(arguments.task, master=arguments.master, takes_fmu=True)
-        sizes = arguments.envs or [8, 64, 1024]
-        for report in bench(make, sizes, arguments.seconds):  # noqa: B007 - shown at the end
-            pass  # each has the speeds of the one before, so that Ctrl-C leaves the last
-
-
-def _show_speeds(report: Report | None, arguments: argparse.Namespace) -> None:
-    if report is not None:
-        say_result(arguments, report.as_dict(), speed_table(report))
+        reports.extend(bench(make, arguments.envs or [8, 64, 1024], arguments.seconds))

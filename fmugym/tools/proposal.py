@@ -6,14 +6,13 @@ and in comments of one line.
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from fmugym.repair.stand_in import replaceable
 from fmugym.search.guessing import both_controllers
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
-from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
+from fmugym.tools.skeleton import Skeleton, given_start, guessed_bounds, needs_bounds, remark
 
 __all__ = ["Proposal", "preload_line"]
 
@@ -244,7 +243,7 @@ class Proposal:
         yield "# Each of these may be set, or drawn anew in each episode, for example:"
         yield '# name = { distribution = "uniform", low = 0.9, high = 1.1 }'
         for variable in self._skeleton.parameters:
-            yield f"# {_key(variable.name)} = {_as_toml(literal(variable))}{remark(variable)}"
+            yield f"# {_key(variable.name)} = {_as_toml(given_start(variable))}{remark(variable)}"
         if self._skeleton.left_out:
             yield f"# {self._skeleton.left_out} more are listed by: fmugym info"
 
@@ -327,7 +326,6 @@ def _quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def _as_toml(text: str) -> str:
-    """A literal of Python as one of TOML."""
-    value = {"True": "true", "False": "false"}.get(text, text)
-    return _quoted(ast.literal_eval(text)) if text[:1] in "\"'" else value
+def _as_toml(value: Any) -> str:
+    """A start value in TOML, which writes numbers and Booleans as JSON does."""
+    return _quoted(value) if isinstance(value, str) else json.dumps(value)

@@ -10,8 +10,9 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from fmugym.errors import ConfigError, plain
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 
-__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark", "rounded_down"]
+__all__ = ["Skeleton", "given_start", "guessed_bounds", "needs_bounds", "remark", "rounded_down"]
 
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
@@ -143,17 +144,13 @@ class Skeleton:
 
         At most ``MOST_PARAMETERS``. Those of the exporter's solver are left out.
         """
-        return self._settable_parameters[:MOST_PARAMETERS]
+        usable = (v for v in self._of("parameter") if v.settable_at_start and literal(v))
+        return [v for v in usable if not _SOLVER.search(v.name)][:MOST_PARAMETERS]
 
     @property
     def left_out(self) -> int:
         """How many parameters of the FMU are not among ``parameters``."""
         return len(self._of("parameter")) - len(self.parameters)
-
-    @cached_property
-    def _settable_parameters(self) -> list[Variable]:
-        usable = (v for v in self._of("parameter") if v.settable_at_start and literal(v))
-        return [v for v in usable if not _SOLVER.search(v.name)]
 
     def _of(self, causality: str) -> list[Variable]:
         """The variables that an environment may use in this role; not all clocks are."""
@@ -218,7 +215,9 @@ class Skeleton:
         unbounded = [v for v in self.inputs if needs_bounds(v)]
         if unbounded:
             yield "# TODO: the FMU gives no limits of these; (low, high) is a guess."
-            yield from _listing("bounds", [_bounds_line(v) for v in unbounded], "{}")
+            ends = [(_quoted(v.name), *guessed_bounds(v)) for v in unbounded]
+            lines = [f"{name}: ({low!r}, {high!r}),  # TODO" for name, low, high in ends]
+            yield from _listing("bounds", lines, "{}")
 
     def _parameter_lines(self) -> Iterator[str]:
         for variable in self.parameters:
@@ -290,11 +289,6 @@ def needs_bounds(variable: Variable) -> bool:
     return variable.kind in {"real", "integer"} and not (math.isfinite(low) and math.isfinite(high))
 
 
-def _bounds_line(variable: Variable) -> str:
-    low, high = guessed_bounds(variable)
-    return f"{_quoted(variable.name)}: ({low!r}, {high!r}),  # TODO"
-
-
 def guessed_bounds(variable: Variable) -> tuple[float, float]:
     """The limits of an input; missing ones are guessed.
 
@@ -345,27 +339,30 @@ def _scalars(variables: Sequence[Variable]) -> list[Variable]:
 
 
 def literal(variable: Variable) -> str:
-    """The start value as the config takes it; empty if the config takes none."""
+    """The start value as Python writes it; empty if the config takes none."""
+    value = given_start(variable)
+    return _quoted(value) if isinstance(value, str) else "" if value is None else repr(value)
+
+
+def given_start(variable: Variable) -> Any:
+    """The start value as the config takes it; None if the config takes none."""
     if variable.shape and variable.is_number and variable.start is not None:
-        return _array_literal(variable)
+        return _array_start(variable)
     value = start_value(variable)
-    if variable.kind == "string" and not variable.shape and isinstance(value, str):
-        return _quoted(value)
-    if not variable.numeric or value is None or isinstance(value, str):
-        return ""  # a text is malformed or not finite here
-    names = [name for name, number in variable.items if number == value]
-    if variable.items:
-        return _quoted(names[0]) if names else ""
-    return repr(value)
+    if variable.kind == "string" and not variable.shape:
+        return value
+    if not variable.numeric or isinstance(value, str):
+        return None  # a text is malformed or not finite here
+    names = (name for name, number in variable.items if number == value)
+    return next(names, None) if variable.items else value
 
 
-def _array_literal(variable: Variable) -> str:
-    """Nested lists of the start values; empty if they are many, or are malformed."""
-    try:
-        numbers = variable.start_numbers if 0 < variable.size <= MOST_ELEMENTS else ()
-    except ConfigError:
-        numbers = ()
-    return repr(np.reshape(numbers, variable.shape).tolist()) if numbers else ""
+def _array_start(variable: Variable) -> Any:
+    """Nested lists of the start values; None if they are many, or are malformed."""
+    with suppress(ConfigError):
+        if 0 < variable.size <= MOST_ELEMENTS:
+            return np.reshape(variable.start_numbers, variable.shape).tolist()
+    return None
 
 
 def _quoted(text: str) -> str:
