@@ -23,6 +23,7 @@ import difflib
 import logging
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Final
 
 from fmugym.signals import ordinary
@@ -38,6 +39,7 @@ __all__ = [
     "TaskError",
     "UnknownParameterError",
     "first_of",
+    "missing_file",
     "nearest_name",
     "plain",
     "printable",
@@ -199,6 +201,20 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
         The error. It suggests the nearest known name, or lists known names if none is near.
     """
     return ConfigError(f"unknown {kind} {shown(name)}; {_hint(name, known)}")
+
+
+def missing_file(kind: str, path: Path, pattern: str) -> ConfigError:
+    """Make the error for a file that does not exist.
+
+    Args:
+        kind: As for ``unknown_name``.
+        path: The file.
+        pattern: What it may have been meant to be, as a glob in its folder.
+    """
+    near = sorted(file.name for file in path.parent.glob(pattern))
+    return ConfigError(
+        f"{unknown_name(kind, path.name, near)} (looked in {shown(str(path.parent))})"
+    )
 
 
 def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentError:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from fmugym.checks import check_integer, check_path, require_regular
 from fmugym.declared.entries import Entry
 from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
-from fmugym.errors import ConfigError, reading, reason, shown, unknown_name
+from fmugym.errors import ConfigError, missing_file, reading, reason, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.signals import ordinary
 
@@ -231,9 +231,7 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_text
             return read(path, status.st_mtime_ns, status.st_size)
     except FileNotFoundError:
-        near = sorted(one.name for one in path.parent.glob(f"*{path.suffix}"))
-        missing = unknown_name("file", path.name, near)
-        raise file.error(f"{missing} (looked in {shown(str(path.parent))})") from None
+        raise file.error(missing_file("file", path, f"*{path.suffix}")) from None
     except ordinary(OSError) as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 

@@ -22,7 +22,7 @@ from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.seasons import read_scenarios
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
 from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
 from fmugym.retired import grouped
 from fmugym.signals import ordinary
@@ -256,9 +256,7 @@ def _read(path: Path) -> Source:
     except UnicodeDecodeError:
         raise ConfigError(f"{shown(str(path))} is no TOML file: {_advice(path)}") from None
     except FileNotFoundError:
-        near = sorted(file.name for file in path.parent.glob("*.toml"))
-        error = unknown_name("task file", path.name, near)
-        raise ConfigError(f"{error} (looked in {shown(str(path.parent))})") from None
+        raise missing_file("task file", path, "*.toml") from None
     except ordinary(OSError) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     try:

@@ -14,7 +14,7 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU
 from fmugym.declared.entries import Entry
 from fmugym.declared.task import Task
-from fmugym.errors import FMULoadError, TaskError, shown, unknown_name
+from fmugym.errors import FMULoadError, TaskError, missing_file
 from fmugym.keys import table_of
 from fmugym.signals import ordinary
 from fmugym.systems import Component, FMUSystem
@@ -214,9 +214,7 @@ def _status(entry: Entry, path: Path) -> Any:
     try:
         return path.stat()
     except ordinary(OSError, ValueError):  # there is none, or no file could have such a name
-        near = sorted(file.name for file in path.parent.glob(f"*{path.suffix or '.fmu'}"))
-        folder = shown(str(path.parent))
-        raise entry.error(f"{unknown_name('FMU', path.name, near)} (looked in {folder})") from None
+        raise entry.error(missing_file("FMU", path, f"*{path.suffix or '.fmu'}")) from None
 
 
 @lru_cache(maxsize=16)
