@@ -84,6 +84,7 @@ import argcomplete
 
 from fmugym.errors import FMUGymError, unknown_name
 from fmugym.signals import ordinary
+from fmugym.tools.demo import add_demo
 from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
 from fmugym.tools.fitting import add_fit
@@ -94,7 +95,6 @@ from fmugym.tools.options import add_common, free_outputs, note, speaking
 from fmugym.tools.plants import add_serve
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
 from fmugym.tools.renamed import renamed
-from fmugym.tools.showing import add_demo
 from fmugym.tools.standard_streams import (
     drop_output,
     escape_what_consoles_lack,

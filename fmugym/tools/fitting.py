@@ -28,6 +28,7 @@ from fmugym.tools.options import (
     say_result,
     write_extension,
 )
+from fmugym.tools.overview import finite_or_none
 from fmugym.tools.targets import maker_of
 
 __all__ = ["add_fit"]
@@ -156,8 +157,8 @@ def _facts(fit: FitResult) -> dict[str, Any]:
         "parameters": {
             name: {
                 "value": value,
-                "standard_error": _number(errors[name]),
-                "interval": [*map(_number, intervals[name])],
+                "standard_error": finite_or_none(errors[name]),
+                "interval": [*map(finite_or_none, intervals[name])],
             }
             for name, value in fit.values.items()
         },
@@ -176,11 +177,6 @@ def _facts(fit: FitResult) -> dict[str, Any]:
         "costs": fit.costs,
         "converged": fit.converged,
     }
-
-
-def _number(value: float) -> float | None:
-    """What JSON has instead of an infinite number is null."""
-    return value if math.isfinite(value) else None
 
 
 def _table(fit: FitResult) -> list[str]:

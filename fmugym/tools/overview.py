@@ -19,7 +19,7 @@ from fmugym.errors import FMULoadError, first_of, plain
 from fmugym.series.choice import matches
 from fmugym.trial.known import known_verdict
 
-__all__ = ["as_text", "headed", "overview", "start_value", "tables"]
+__all__ = ["as_text", "finite_or_none", "headed", "overview", "start_value", "tables"]
 
 SCHEMA: Final = 1
 """Raised when a key goes or changes its meaning; new keys do not raise it."""
@@ -116,6 +116,10 @@ _TEXTS: Final = (
     "description",
     "generation_tool",
 )
+_OF_VARIABLE: Final = (
+    *("name", "causality", "variability", "initial", "type", "unit", "nominal", "description"),
+    *("settable_at_start", "settable_in_step"),
+)
 _TIMES: Final = ("start_time", "stop_time", "step_size", "tolerance")
 
 
@@ -127,25 +131,16 @@ def _is_wanted(variable: Variable, everything: bool, pattern: str | None) -> boo
 
 def _row(variable: Variable) -> dict[str, Any]:
     return {
-        "name": variable.name,
-        "causality": variable.causality,
-        "variability": variable.variability,
-        "initial": variable.initial,
-        "type": variable.type,
+        **{name: getattr(variable, name) for name in _OF_VARIABLE},
         "shape": list(variable.shape),
-        "unit": variable.unit,
-        "min": _finite(variable.minimum),
-        "max": _finite(variable.maximum),
-        "nominal": variable.nominal,
+        "min": finite_or_none(variable.minimum),
+        "max": finite_or_none(variable.maximum),
         "start": start_value(variable),
         "items": [{"name": name, "value": value} for name, value in variable.items],
-        "description": variable.description,
-        "settable_at_start": variable.settable_at_start,
-        "settable_in_step": variable.settable_in_step,
     }
 
 
-def _finite(number: float) -> float | None:
+def finite_or_none(number: float) -> float | None:
     """JSON has no infinities."""
     return number if math.isfinite(number) else None
 

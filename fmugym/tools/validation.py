@@ -334,14 +334,16 @@ def _has_effect(env: FMUEnv, given: Mapping[str, Any]) -> bool:
     pairs = {name: _two_values(env, name, value) for name, value in given.items()}
     if all(first == second for first, second in pairs.values()):
         return True
+    # The middle action, at which a process may rest, and another one.
+    others = itertools.islice(_extremes(env.action_space, ()), 1)
+    actions = [_middle(env.action_space), *(first for _, first, _ in others)]
     options = [
         {"model_parameters": {name: pair[place] for name, pair in pairs.items()}}
         for place in (0, 1)
     ]
     try:
         return any(
-            _differ(*(_play(env, _always(action), one) for one in options))
-            for action in _constants(env.action_space)
+            _differ(*(_play(env, _always(action), one) for one in options)) for action in actions
         )
     except FMUGymError:  # the FMU does not take a value that was made up here
         return True
@@ -376,12 +378,6 @@ def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
             f"stay at their start values: {', '.join(idle)}",
             "write them by actions, [inputs] or data, or fix them under [parameters]",
         )
-
-
-def _constants(space: Any) -> Iterator[Any]:
-    """Actions that show effects: the middle one, at which a process may rest, and another one."""
-    yield _middle(space)
-    yield from (first for _, first, _ in itertools.islice(_extremes(space, ()), 1))
 
 
 def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
