@@ -44,7 +44,7 @@ from fmugym.pool.spec import SAMPLINGS
 from fmugym.systems.components import Component
 from fmugym.systems.wired import SYSTEM
 
-__all__ = ["AGENT", "DEVICE", "PLANT", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
+__all__ = ["AGENT", "DEVICE", "KPI", "PLANT", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
 
 SCHEMA: Final = Path(__file__).parent / "task.schema.json"
 """What the keys are, for editors; ``docs/_site/keys.py`` writes it."""

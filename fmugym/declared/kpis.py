@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from fmugym.declared.computed import Value, where
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
+from fmugym.declared.format import KPI
 from fmugym.declared.mathematics import maximum, minimum
 
-__all__ = ["KPIS", "Kpi", "kpi_name", "read_kpi"]
-
-KPIS: Final = ("sum", "mean", "min", "max", "last")
-"""What a figure may be of the values in the steps of an episode."""
+__all__ = ["Kpi", "kpi_name", "read_kpi"]
 
 
 class Kpi(NamedTuple):
@@ -21,7 +19,7 @@ class Kpi(NamedTuple):
     Attributes:
         entry: Where it stands.
         expression: Its value in a step; or an expression of other figures.
-        how: One of ``KPIS``; None for an expression of other figures.
+        how: The key of the format that has the expression; None for an expression of other figures.
     """
 
     entry: Entry
@@ -61,5 +59,5 @@ def kpi_name(name: str) -> str:
 
 def read_kpi(entry: Entry) -> Kpi:
     """Read a figure."""
-    how = next((how for how in KPIS if how in entry.value), "expr")
-    return Kpi(entry, entry.required(how).value, None if how == "expr" else how)
+    how = next((how for how in KPI.one_of if how in entry.value), KPI.short)
+    return Kpi(entry, entry.required(how).value, None if how == KPI.short else how)

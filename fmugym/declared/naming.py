@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from enum import Enum
 from functools import reduce
 from typing import Any, Final
@@ -317,20 +316,14 @@ class Naming:
             raise derived.entry.error(f"{name!r} depends on itself")
         if key not in self._derived:  # many may read it
             self._derived[key] = None
-            with derived.entry.noting(), self._opened(name):
+            self._open.append(name)
+            with derived.entry.noting():
                 self._derived[key] = self.value(derived.entry, derived.expression, moment)
+            self._open.pop()
         value = self._derived[key]
         if value is None:
             raise ConsequenceError(f"{name!r} has a mistake where it is declared")
         return value
-
-    @contextmanager
-    def _opened(self, name: str) -> Iterator[None]:
-        self._open.append(name)
-        try:
-            yield
-        finally:
-            self._open.pop()
 
     def _value_of_variable(self, name: str, variable: TaskVariable, moment: Moment) -> Value:
         declared = self.declared

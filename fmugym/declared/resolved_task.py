@@ -103,7 +103,9 @@ class ResolvedTask:
             self._naming = Naming(declared, time_step, warm_steps)
             self._kept = histories(self._naming)
             self._seen, self._sensors = observed_values(self._naming, self._kept)
-            self._find_mistakes()
+            for entry, make in self._makers():
+                with entry.noting():
+                    make()
         root.mistakes.require_none()
         with root.noting():
             self._make()
@@ -143,13 +145,8 @@ class ResolvedTask:
         read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
 
-    def _find_mistakes(self) -> None:
-        """Evaluate everything once, so that one error tells all mistakes."""
-        for entry, make in self._makers():
-            with entry.noting():
-                make()
-
     def _makers(self) -> Iterator[tuple[Entry, Callable[[], Any]]]:
+        """What evaluates everything once, so that one error tells all mistakes."""
         declared = self._declared
         for entry, expression, moment in self._plain_expressions():
             yield entry, partial(self._naming.value, entry, expression, moment)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
@@ -161,8 +160,13 @@ class TaskVariables:
             ConsequenceError: If one may be. It is where the name is declared.
         """
         mistakes, sources = self._root.mistakes, self._root.sources
-        sections = filter(partial(self._may_declare, name), (*NAMING, "reward", "costs", "kpis"))
-        places = [(section, name) for section in sections]
+        sections = (*NAMING, "reward", "costs", "kpis")
+        values = {section: self._root.child(section).value for section in sections}
+        places = [
+            (section, name)
+            for section, value in values.items()
+            if value is None or (isinstance(value, Mapping) and name in value)
+        ]
         setpoints = self._root.child("setpoints").items()
         places += [("setpoints", one) for one in setpoints if name.startswith(f"{one}_")]
         misspelt = [s.document.get(key) for key in mistakes.unknown_sections for s in sources]
@@ -170,10 +174,6 @@ class TaskVariables:
         is_hidden = not mistakes.hidden.isdisjoint((name, name.partition(".")[0]))
         if is_hidden or is_misspelt or any(map(mistakes.explain, places)):
             raise ConsequenceError(f"{name!r} has a mistake where it is declared")
-
-    def _may_declare(self, name: str, section: str) -> bool:
-        value = self._root.child(section).value
-        return value is None or (isinstance(value, Mapping) and name in value)
 
     def find(self, entry: Entry, name: str, role: str, others: Sequence[str] = ()) -> TaskVariable:
         """The variable of a name.
