@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +81,11 @@ class Pilot:
         """
         low, high = self.variable.range
         space = spaces.Box(np.float32(low), np.float32(high), (1,), np.float32)
-        self.controller.bind(_Many(count, space, time_step), self._names)
+        env = SimpleNamespace(
+            num_envs=count, single_action_space=space, time_step=time_step, unphysical_keys=()
+        )
+        env.unwrapped = env.config = env
+        self.controller.bind(env, self._names)
 
     def act(self, env: Any) -> Any:
         """Choose the next action, as the agent would write it, shape (M,)."""
@@ -108,21 +113,6 @@ class Pilot:
         for place, signal in enumerate(self._signals(env)):
             rows[:, place] = signal
         return one.act(rows)[:, 0].astype(np.float64)
-
-
-class _Many:
-    """Some environments with one action, as controllers look at them."""
-
-    unphysical_keys = ()
-
-    def __init__(self, count: int, space: spaces.Box, time_step: float) -> None:
-        self.num_envs, self.single_action_space, self.time_step = count, space, time_step
-
-    @property
-    def unwrapped(self) -> _Many:
-        return self
-
-    config = unwrapped
 
 
 class DeclaredWarmUp(WarmUp):

@@ -20,7 +20,7 @@ from fmugym.config import FOREIGN
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.seasons import read_scenarios
-from fmugym.declared.writing import as_toml, revised
+from fmugym.declared.writing import as_toml, revised, write_new
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
 from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
@@ -241,8 +241,7 @@ class Task:
             text = re.sub(r"\A#:schema \./.*\n", "", text)  # the schema lies beside the other file
         if text is None:
             text = as_toml(document)
-        with file.open("x", encoding="utf-8", newline="\n") as stream:
-            stream.write(text)
+        write_new(file, text)
 
 
 def _root(source: Source) -> Entry:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import datetime
 import tomllib
 from collections.abc import Mapping, MutableMapping
+from pathlib import Path
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 
-__all__ = ["as_toml", "revised"]
+__all__ = ["as_toml", "revised", "write_new"]
 
 Keys = tuple[str, ...]
 
@@ -19,6 +20,16 @@ _INLINE: Final = ("fmu", "clock", "warm_up")
 
 _TABLES: Final = (("plant", "tags"), ("plant", "data"))
 """Tables within others that have a heading of their own."""
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a text to a new file.
+
+    Raises:
+        FileExistsError: If the file exists.
+    """
+    with path.open("x", encoding="utf-8", newline="\n") as file:
+        file.write(text)
 
 
 def as_toml(document: Mapping[str, Any]) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
-from fmugym.declared.writing import as_toml
+from fmugym.declared.writing import as_toml, write_new
 from fmugym.episodes.progress_bars import quiet
 from fmugym.episodes.simulation import Player, action_of, policy_of
 from fmugym.errors import ConfigError, plain, shown
@@ -395,8 +395,7 @@ def write_extension(path: Path, target: str, more: Mapping[str, Any]) -> None:
     if Path(target).is_file():
         base = os.path.relpath(Path(target).absolute(), path.absolute().parent)
         document = {"extends": Path(base).as_posix(), **document}
-    with path.open("x", encoding="utf-8", newline="\n") as file:
-        file.write(as_toml(document))
+    write_new(path, as_toml(document))
 
 
 def _for_any_file(text: str) -> str:
@@ -411,7 +410,6 @@ def write_text(text: str, output: Path | None, notes: Iterable[str]) -> None:
     if output is None:
         print(_for_any_file(text), end="")
     else:
-        with output.open("x", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        write_new(output, text)
     for one in notes:
         note(one)
