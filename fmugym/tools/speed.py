@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any, Final
@@ -86,12 +87,9 @@ def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) 
     if number_of("--seconds", seconds) <= 0:
         raise ConfigError(f"--seconds must be positive, got {seconds:g}")
     load: float | None = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    env = make_env()
-    try:
+    with closing(make_env()) as env:
         time_step = env.inside.spec.time_step
         report = Report((_of_single(env, seconds),), time_step, _processors(), load)
-    finally:
-        env.close()
     yield report
     for size in sizes:
         report = replace(report, speeds=(*report.speeds, _of_vector(make_env, size, seconds)))
@@ -120,16 +118,13 @@ def _of_single(env: FMUEnv, seconds: float) -> Speed:
 
 
 def _of_vector(make_env: Callable[[], FMUEnv], size: int, seconds: float) -> Speed:
-    envs = FMUVectorEnv(make_env, size, autoreset_mode=AutoresetMode.SAME_STEP)
-    try:
+    with closing(FMUVectorEnv(make_env, size, autoreset_mode=AutoresetMode.SAME_STEP)) as envs:
         envs.reset(seed=0)
         actions = [envs.action_space.sample() for _ in range(16)]
         took = _fastest(lambda number: envs.step(actions[number % 16]), seconds)
         envs.reset(seed=0)
         share = _share(envs.inside.prototype, seconds, took)
         return Speed(size, envs.inside.engine.way, size / took, took * 1e6, share)
-    finally:
-        envs.close()
 
 
 def _fastest(step: Callable[[int], Any], seconds: float) -> float:

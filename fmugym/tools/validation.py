@@ -10,6 +10,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -88,8 +89,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
     Raises:
         FMUGymError: If the environment cannot be made.
     """
-    env = make_env()
-    try:
+    with closing(make_env()) as env:
         env.action_space.seed(0)
         first = _play(env, env.action_space.sample)
         findings = [*_findings(env, first)]
@@ -103,8 +103,6 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         others = [*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards)]
         replay = Replay.of(env)
         steps = None if first.terminated else env.config.max_episode_steps
-    finally:
-        env.close()
     more, advices = _repeated(replay, steps)
     advices += others
     checks = {one.check for one in more}
