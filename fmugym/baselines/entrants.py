@@ -92,10 +92,11 @@ class Entrant:
         """
         if len(returns.T) == 1:
             return
-        first, second = (_ranks(part.mean(axis=1)) for part in np.array_split(returns, 2, axis=1))
-        size = math.sqrt((first @ first) * (second @ second))
-        if size > 0:  # otherwise all have reached the same
-            self.agreement += _FADE * (float(first @ second) / size - self.agreement)
+        halves = (part.mean(axis=1) for part in np.array_split(returns, 2, axis=1))
+        ranks = [np.unique(half, return_inverse=True)[1] for half in halves]
+        if np.ptp(ranks, axis=1).all():  # otherwise all have reached the same
+            correlation = float(np.corrcoef(ranks)[0, 1])
+            self.agreement += _FADE * (correlation - self.agreement)
         if self.agreement < _AGREEMENT and self.takes_more_episodes():
             self.agreement = 1.0
 
@@ -119,10 +120,3 @@ class Entrant:
             self.merit, self.gained, self.starts = max(merits), self.rounds, 0
             self.best = self.make.with_numbers(self.cma.mean)
         self.lead = NO_MERIT
-
-
-def _ranks(values: FloatArray) -> FloatArray:
-    """Ranks beside their mean, equal ones for equal values."""
-    _, inverse = np.unique(values, return_inverse=True)
-    ranks: FloatArray = inverse - inverse.mean()
-    return ranks
