@@ -100,8 +100,9 @@ def tune(
     """Find the numbers with which a controller gets the largest rewards.
 
     In each round, all candidates play the same episodes side by side in one vector environment. The
-    next candidates come from the covariance matrix adaptation of ``fmugym.baselines.cma``. The same
-    arguments give the same result.
+    first candidates are everywhere in the ranges. The next ones come from the covariance matrix
+    adaptation of ``fmugym.baselines.cma``, which begins at the best of them. The same arguments
+    give the same result.
 
     Args:
         make_controller: Makes a controller from the numbers by keyword, such as

@@ -53,12 +53,12 @@ _STARTS: Final = 3
 """A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
 after so many starts in a row that were in vain."""
 
-_RANDOM: Final = 64
+_RANDOM: Final = 32
 _BEST_PART: Final = 4
 """Of so many candidates with weights at random, this part tells what observations are like."""
 
 _FINEST: Final = 1e-3
-"""The smallest constants that candidates add without a controller; the largest ones are 1."""
+"""The size of the weights of the finest ones; that of the coarsest ones is 1."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
@@ -203,7 +203,7 @@ class Search:
         linear = self.probe.linear
         history = replace(linear, name="linear with history", history=True)
         network = replace(linear, name="network", hidden=16)
-        scale = self._scale(arena, history, baseline.text)
+        scale = self._scale(arena, replace(history, text=baseline.text))
         *linear_ones, network = (
             replace(one, scale=scale[:, : one.features]) for one in (linear, history, network)
         )
@@ -213,30 +213,27 @@ class Search:
             self._contenders.append(self._entrant(*pair))
         self._contenders.append(self._entrant(network))
 
-    def _scale(self, arena: Arena, history: Agent, controller: str | None) -> FloatArray:
-        """What observations are like while candidates add constants to what a controller decides.
+    def _scale(self, arena: Arena, history: Agent) -> FloatArray:
+        """What observations are like while candidates correct what a controller decides.
 
-        Without a controller, some constants are small: only these keep an unstable process near.
-        All of them let a process drift that integrates them, so that linear policies with weights
-        at random then tell the scale anew.
+        At first these are constants. All of them let a process drift that integrates them, so that
+        linear policies with weights at random then tell the scale anew.
         """
-        if controller is not None:
-            return self._seen(arena, replace(history, text=controller), history.acting)
-        scale = self._seen(arena, history, history.acting, _FINEST)
+        scale = self._seen(arena, history, history.acting)
         return self._seen(arena, replace(history, scale=scale), self.probe.linear.size)
 
-    def _seen(self, arena: Arena, agent: Agent, width: int, finest: float = 1.0) -> FloatArray:
+    def _seen(self, arena: Arena, agent: Agent, width: int) -> FloatArray:
         """What observations are like for the best of some candidates.
 
         Policies that are worth something see the like, while others may drive the process far away.
+        Some change little: only these keep an unstable process near.
 
         Args:
             arena: Where they play.
             agent: What they have in common.
             width: How many weights they have, at random; the others are 0.
-            finest: The size of the smallest weights; that of the largest ones is 1.
         """
-        sizes = np.geomspace(1.0, finest, _RANDOM)[:, None]
+        sizes = np.geomspace(1.0, _FINEST, _RANDOM)[:, None]
         rows = agent.extended(sizes * self._rng.standard_normal((_RANDOM, width)))
         outcome = arena.play(agent, rows, self._training(self.episodes), has_moments=True)
         self.rounds += 1
