@@ -76,7 +76,8 @@ class CMA:
         half = self._rng.standard_normal((-(-count // 2), n))
         self._white = white = np.concatenate([half, -half])[:count]
         self._steps = white * self._root if self._is_separable else white @ self._root
-        return self.mean + self.sigma * self._steps
+        candidates: FloatArray = self.mean + self.sigma * self._steps
+        return candidates
 
     def tell(self, order: npt.NDArray[np.int64]) -> None:
         """Learn from the order of the candidates, the best one first."""

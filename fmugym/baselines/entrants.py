@@ -95,8 +95,8 @@ class Entrant:
         halves = (part.mean(axis=1) for part in np.array_split(returns, 2, axis=1))
         ranks = [np.unique(half, return_inverse=True)[1] for half in halves]
         if np.ptp(ranks, axis=1).all():  # otherwise all have reached the same
-            correlation = float(np.corrcoef(ranks)[0, 1])
-            self.agreement += _FADE * (correlation - self.agreement)
+            correlation = np.min(np.corrcoef(ranks))
+            self.agreement += _FADE * (float(correlation) - self.agreement)
         if self.agreement < _AGREEMENT and self.takes_more_episodes():
             self.agreement = 1.0
 

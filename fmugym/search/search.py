@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
 
 from fmugym.baselines.arena import Arena, Merit
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.controller import FloatArray
 from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
@@ -98,6 +98,8 @@ class Search:
         self._fixed = [one for one in probe.agents if one.is_found]
         self._tuned = [self._entrant(one) for one in probe.agents if not one.is_found]
         self._contenders: list[Entrant] = []
+        self._scale = probe.linear.scale
+        self._widths = [probe.linear.size, probe.linear.acting]
         self.best: Agent | None = None
         self.baseline: Agent | None = None
         self.merit = self.merit_of_baseline = NO_MERIT
@@ -105,7 +107,7 @@ class Search:
     @property
     def is_over(self) -> bool:
         """Whether nothing more is gained."""
-        return self.baseline is not None and not self._active
+        return not self._widths and not self._active
 
     @property
     def tuning(self) -> Entrant | None:
@@ -128,13 +130,17 @@ class Search:
     # Rounds.
 
     def advance(self, arena: Arena) -> None:
-        """Go on by one round, or by those that tell what observations are like."""
+        """Go on by one round, or by one that tells what observations are like."""
         if self.tuning:
             self._play(self.tuning, arena)
-        elif self.baseline is None:
-            self.best, self.merit = _best_of(arena, self.others(), self._seeds(VALIDATION))
-            self.baseline, self.merit_of_baseline = self.best, self.merit
-            self._enter(arena, self.best)
+        elif self._widths:
+            if self.baseline is None:
+                known = _scored(arena, self._fixed, self._seeds(VALIDATION))
+                known += [(one.best, one.merit) for one in self._tuned]
+                self.best, self.merit = self.baseline, self.merit_of_baseline = max(
+                    known, key=itemgetter(1)
+                )
+            self._look(arena, self.baseline)
         else:
             leaders = self._leaders()
             self._play(self._next(leaders), arena)
@@ -195,50 +201,38 @@ class Search:
         population = _MANY if agent.observed else FEW
         return CMA(mean, sigma, population, self._rng, largest=_LARGEST, growth=_GROWTH)
 
-    def _enter(self, arena: Arena, baseline: Agent) -> None:
-        """Find the scale of what is observed, and let classes of policies enter.
+    def _look(self, arena: Arena, baseline: Agent) -> None:
+        """See what observations are like for the best of some candidates that correct the baseline.
 
-        Linear ones are followed by those that also see the past.
+        Policies that are worth something see the like, while others may drive the process far away.
+        Some change little: only these keep an unstable process near. In a first look they add
+        constants. All of these let a process drift that integrates them, so that linear policies
+        tell the scale anew. Then classes of policies enter.
         """
-        linear = self.probe.linear
-        history = replace(linear, name="linear with history", history=True)
-        network = replace(linear, name="network", hidden=16)
-        scale = self._scale(arena, replace(history, text=baseline.text))
+        history = replace(self.probe.linear, name="linear with history", history=True)
+        agent = replace(history, text=baseline.text, scale=self._scale)
+        sizes = np.geomspace(1.0, _FINEST, _RANDOM)[:, None]
+        drawn = self._rng.standard_normal((_RANDOM, self._widths.pop()))
+        rows, seeds = agent.extended(sizes * drawn), self._training(self.episodes)
+        outcome = arena.play(agent, rows, seeds, has_moments=True)
+        self.rounds += 1
+        best = outcome.moments[outcome.order[: _RANDOM // _BEST_PART]]
+        self._scale = scale_of(best.sum(axis=(0, 1)))
+        if not self._widths:
+            self._enter(history, baseline)
+
+    def _enter(self, history: Agent, baseline: Agent) -> None:
+        """Let classes of policies enter. Linear ones are followed by those that see the past."""
+        network = replace(self.probe.linear, name="network", hidden=16)
         *linear_ones, network = (
-            replace(one, scale=scale[:, : one.features]) for one in (linear, history, network)
+            replace(one, scale=self._scale[:, : one.features])
+            for one in (self.probe.linear, history, network)
         )
         for text in dict.fromkeys((baseline.text, None)):
             prefix = f"{baseline.name} + " if text else ""
             pair = (replace(one, name=prefix + one.name, text=text) for one in linear_ones)
             self._contenders.append(self._entrant(*pair))
         self._contenders.append(self._entrant(network))
-
-    def _scale(self, arena: Arena, history: Agent) -> FloatArray:
-        """What observations are like while candidates correct what a controller decides.
-
-        At first these are constants. All of them let a process drift that integrates them, so that
-        linear policies with weights at random then tell the scale anew.
-        """
-        scale = self._seen(arena, history, history.acting)
-        return self._seen(arena, replace(history, scale=scale), self.probe.linear.size)
-
-    def _seen(self, arena: Arena, agent: Agent, width: int) -> FloatArray:
-        """What observations are like for the best of some candidates.
-
-        Policies that are worth something see the like, while others may drive the process far away.
-        Some change little: only these keep an unstable process near.
-
-        Args:
-            arena: Where they play.
-            agent: What they have in common.
-            width: How many weights they have, at random; the others are 0.
-        """
-        sizes = np.geomspace(1.0, _FINEST, _RANDOM)[:, None]
-        rows = agent.extended(sizes * self._rng.standard_normal((_RANDOM, width)))
-        outcome = arena.play(agent, rows, self._training(self.episodes), has_moments=True)
-        self.rounds += 1
-        best = outcome.moments[outcome.order[: _RANDOM // _BEST_PART]]
-        return scale_of(best.sum(axis=(0, 1)))
 
     # Who wins.
 
@@ -265,10 +259,11 @@ class Search:
     def winner(self, arena: Arena) -> Agent | None:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
-        return _best_of(arena, agents, seeds)[0] if agents else None
+        return max(_scored(arena, agents, seeds), key=itemgetter(1))[0] if agents else None
 
 
-def _best_of(arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]) -> tuple[Agent, Merit]:
-    """The best agent, the first one of equals, and its merit."""
-    merits = [one.play(arena, seeds).merits[0] for one in agents]
-    return max(zip(agents, merits, strict=True), key=lambda pair: pair[1])
+def _scored(
+    arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]
+) -> list[tuple[Agent, Merit]]:
+    """Agents, and what they are worth in the same episodes."""
+    return [(one, one.play(arena, seeds).merits[0]) for one in agents]

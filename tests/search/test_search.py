@@ -865,7 +865,8 @@ def names_of(search):
 
 def test_a_history_enters_when_a_correction_gains_nothing_without_it():
     search, field = search_of_agents(GIVEN), Field(1.0)
-    search.advance(field)
+    while not search._contenders:
+        search.advance(field)
     first = search._contenders[0]
     while first.rounds - first.gained < 14:
         search.advance(field)
