@@ -15,7 +15,6 @@ from fmugym.task import native_draws as module
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector import streams as streams_module
 from fmugym.vector.streams import EpisodeStreams
 
 SEEDS = [
@@ -50,8 +49,7 @@ class OwnUniform(Uniform):
 @pytest.fixture(params=[True, False], ids=lambda native: "native" if native else "python")
 def native(request, monkeypatch):
     """Draw with the C extension, and as if there were none."""
-    for place in (module, streams_module):
-        monkeypatch.setattr(place, "has_native_pool", lambda: request.param)
+    monkeypatch.setattr(module, "has_native_pool", lambda: request.param)
     return request.param
 
 
