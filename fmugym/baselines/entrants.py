@@ -97,15 +97,14 @@ class Entrant:
         if np.ptp(ranks, axis=1).all():  # otherwise all have reached the same
             correlation = np.min(np.corrcoef(ranks))
             self.agreement += _FADE * (float(correlation) - self.agreement)
-        if self.agreement < _AGREEMENT and self.takes_more_episodes():
+        if self.agreement < _AGREEMENT:
+            self.take_more_episodes()
             self.agreement = 1.0
 
-    def takes_more_episodes(self) -> bool:
-        """Take twice as many episodes; False if that is no use."""
-        if not 1 < self.episodes < _MOST_EPISODES:
-            return False
-        self.episodes *= 2
-        return True
+    def take_more_episodes(self) -> None:
+        """Take twice as many episodes, unless all are the same or they are enough."""
+        if 1 < self.episodes < _MOST_EPISODES:
+            self.episodes *= 2
 
     def validate(self, arena: Arena, seeds: Sequence[int]) -> None:
         """Let the mean of the search and the leader play; the better one is kept if it is the best.

@@ -30,7 +30,7 @@ def rows_of(space: spaces.Space[Any], observations: Any, count: int) -> FloatArr
             columns += [1.0 * (row[:, None] == np.array(choice)) for row, choice in pairs]
         else:
             columns.append(rows)
-    return np.concatenate(columns, axis=1) if len(columns) > 1 else columns[0]
+    return np.concatenate(columns, axis=1)
 
 
 def _parts(space: Any, values: Any = None) -> Iterator[tuple[Any, Any]]:

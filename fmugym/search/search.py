@@ -160,7 +160,7 @@ class Search:
 
     def _change(self, leader: Entrant) -> None:
         """Give a leader that gains nothing a new start with more episodes; it may be its last."""
-        leader.takes_more_episodes()
+        leader.take_more_episodes()
         leader.starts += 1
         leader.cma = self._cma(leader.best)
         leader.gained = leader.rounds

@@ -180,15 +180,15 @@ class Searching:
                 f"{probe.usual_steps} steps, so that {who}; for more, "
                 f"give --minutes {np.ceil(took * _ENOUGH / 60):.0f}"
             )
-        limits = {
-            f"for {self.seconds:g} s": self.seconds,
-            f"until round {self.rounds}": self.rounds,
-            f"for at most {self.steps} steps": self.steps,
-        }
+        limits = (
+            f"for {self.seconds:g} s",
+            f"until round {self.rounds}",
+            f"for at most {self.steps} steps",
+        )
         kind = "one episode (all are the same)" if probe.is_same else "new episodes"
         self.tell(
             f"candidates play {kind} of up to {probe.most_steps} steps, "
-            + " and ".join(text for text, limit in limits.items() if limit < np.inf)
+            + " and ".join(text for text in limits if str(np.inf) not in text)
         )
 
     def _winner(self) -> Agent:
@@ -250,9 +250,8 @@ class Searching:
     def _is_over(self, longest: float) -> bool:
         """Whether there is no time for another round like the longest, or nothing left to do."""
         found = self._found
-        if found.is_over or found.rounds >= self.rounds:
-            return True
-        if not self._is_enough and not found.tuning and found.baseline is None:
+        goes_on = self._is_enough or found.tuning or found.baseline
+        if found.is_over or found.rounds >= self.rounds or not goes_on:
             return True
         done, seconds = self._arena.steps - self._before, monotonic() - self._begin
         # all episodes may end before they are as long as they may be
