@@ -8,7 +8,8 @@ an ordinary exception. Nothing else may come out. Afterwards a reset begins an e
 one without a signal, bit for bit, and no file is left.
 
 Some things are not the package's to mend. Python drops what is raised in a destructor, lxml does so
-while it reads a file, and ``zipfile`` may raise something else.
+while it reads a file, and ``zipfile`` may raise something else. A folder whose destructor has been
+interrupted goes at the end of the process.
 
 When and where a signal arrives depends on the machine, so a case cannot be repeated exactly. See
 ``fuzz_driver.py``. Not for Windows, which has no such timers.
@@ -31,6 +32,7 @@ import numpy as np
 from fuzz_driver import Case, CaseError, main, require
 
 import fmugym
+from fmugym.archive.temporary import remove_rest
 from fmugym.envs import CartPoleEnv
 
 NUM_ENVS = 3
@@ -54,7 +56,12 @@ class Alarm:
     Args:
         delay: Seconds.
         error: What the handler raises.
+
+    Attributes:
+        may_have_been_lost: Whether what one of them has raised may have been dropped or replaced.
     """
+
+    may_have_been_lost = False
 
     def __init__(self, delay, error):
         self._delay, self._error = delay, error
@@ -82,6 +89,7 @@ class Alarm:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
         may_be_lost = any(place in self._where for place in LOSING)
+        Alarm.may_have_been_lost |= may_be_lost
         if came_out is not None and not may_be_lost and not self._is_ours(came_out):
             raise CaseError(f"{type(came_out).__name__}: {came_out}") from came_out
         is_lost = came_out is None and self._rang and not may_be_lost
@@ -220,6 +228,8 @@ def program():
             os.environ[PROBE] = str(fmu_tools.probe_fmu(folder))
             yield make
         gc.collect()
+        if Alarm.may_have_been_lost:
+            remove_rest()
     finally:
         sys.unraisablehook = before
 
