@@ -69,8 +69,9 @@ class CMA:
     def ask(self) -> FloatArray:
         """Draw the candidates of a round, shape (population, n).
 
-        Half of them mirror the others: so they tell more than independent ones (D. Brockhoff et
-        al., Parallel Problem Solving from Nature XI, 2010).
+        Half of them mirror the others: so they tell more than independent ones. Of a pair only the
+        better one counts: two would cancel, and steps become shorter by chance (A. Auger, D.
+        Brockhoff and N. Hansen, Genetic and Evolutionary Computation Conference, 2011).
         """
         count, n = self._shape
         half = self._rng.standard_normal((-(-count // 2), n))
@@ -81,7 +82,8 @@ class CMA:
 
     def tell(self, order: npt.NDArray[np.int64]) -> None:
         """Learn from the order of the candidates, the best one first."""
-        chosen = order[: self._weights.size]
+        _, places = np.unique(order % -(-len(order) // 2), return_index=True)
+        chosen = order[np.sort(places)][: self._weights.size]
         best, white = self._steps[chosen], self._weights @ self._white[chosen]
         step = self._weights @ best
         mean, (norm, sigma) = self.mean + self.sigma * step, self._limits

@@ -44,7 +44,7 @@ class Entrant:
         best: The agent with the best numbers in validation; None before the first one.
         merit: Its merit.
         gained: The round in which it was found, or in which something was changed.
-        starts: How often the search has started anew since then.
+        starts: How often in a row it has gained nothing in a start.
         agreement: The mean correlation of ranks by two halves of the episodes.
         last_round: The round of the whole search in which it played last.
     """

@@ -207,12 +207,21 @@ class FitResult:
         refit_initial_states = check_flag("refit_initial_states", refit_initial_states)
         if lead_in is not None:
             lead_in = check_number("lead_in", lead_in, positive=True, may_be_infinite=True)
-        experiment = self.experiment
+        experiment, shifted = self._for_prediction(trajectories)
         if lead_in is not None and refit_initial_states:
             experiment = replace(experiment, lead_in=lead_in)
-        fitted = {name: (value, *self.bounds[name]) for name, value in self.values.items()}
-        with closing(Problem(experiment, fitted, trajectories, refit_initial_states)) as problem:
+        with closing(Problem(experiment, {}, shifted, refit_initial_states)) as problem:
             return problem.compare(problem.start)
+
+    def _for_prediction(
+        self, trajectories: Sequence[Trajectory]
+    ) -> tuple[Experiment, list[Trajectory]]:
+        """Fix the fitted values, and add fitted constants to the logged inputs."""
+        description = self.experiment.fmu.description
+        offsets = {n for n in self.values if description.variable(n).causality == "input"}
+        fixed = {n: v for n, v in self.values.items() if n not in offsets}
+        experiment = replace(self.experiment, fixed={**self.experiment.fixed, **fixed})
+        return experiment, [_shifted(t, {n: self.values[n] for n in offsets}) for t in trajectories]
 
 
 def fit_parameters(
@@ -315,3 +324,10 @@ def fit_of(
             message=solution.message,
             experiment=experiment,
         )
+
+
+def _shifted(trajectory: Trajectory, offsets: Mapping[str, float]) -> Trajectory:
+    """Add fitted constants to the logged inputs."""
+    nothing = np.zeros(len(trajectory))
+    shifted = {n: trajectory.inputs.get(n, nothing) + value for n, value in offsets.items()}
+    return replace(trajectory, inputs={**trajectory.inputs, **shifted})

@@ -51,7 +51,7 @@ _SHARE: Final = 10
 _ROUNDS_WITHOUT_GAIN: Final = 15
 _STARTS: Final = 3
 """A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
-after so many starts in a row that were in vain."""
+after so many starts in a row, the first one included, that were in vain."""
 
 _RANDOM: Final = 32
 _BEST_PART: Final = 4

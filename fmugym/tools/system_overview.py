@@ -10,7 +10,7 @@ from typing import Any
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.task_fmu import fmu_of
-from fmugym.errors import plain
+from fmugym.errors import ConfigError, plain
 from fmugym.systems import FMUSystem
 from fmugym.tools.overview import headed, overview, tables
 
@@ -28,7 +28,17 @@ def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
         ConfigError: If the task file or the system has a mistake.
         FMULoadError: If the archive or an FMU cannot be read.
     """
-    task = Task.read(path) if path.suffix.lower() == ".toml" else Task.from_dict({"fmu": path})
+    if path.suffix.lower() == ".ssp":
+        return FMUSystem.read(path, master=master)
+    if path.suffix.lower() == ".toml":
+        return _model_of(Task.read(path), master)
+    if master is not None:
+        raise ConfigError(f"a master is for systems; {path.name} is a single FMU")
+    return FMU(path)
+
+
+def _model_of(task: Task, master: str | None) -> FMU | FMUSystem:
+    """The system that a task file names, or the FMU with the libraries of the task."""
     source = fmu_of(task, master)
     if isinstance(source, FMUSystem):
         return source

@@ -153,7 +153,7 @@ class Searching:
         name = shown(str(self.folder))
         with reading(f"{name} has no search to resume"):
             found: Search = pickle.loads((self.folder / STATE).read_bytes())
-            before = found.probe.task
+            before, _ = found.probe.task, found.is_over  # one of another version lacks something
         with closing(self.make_env()) as env:
             now = task_of(env)
         changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]

@@ -37,6 +37,7 @@ def __getattr__(name: str) -> Callable[..., Any]:
 
 def _make(
     env_class: Callable[..., Any] | str,
+    /,
     num_envs: int = 1,
     max_episode_steps: int | None = None,
     autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,

@@ -4,6 +4,7 @@ import csv
 import io
 import itertools
 import json
+import pickle
 import re
 import shutil
 import sys
@@ -222,9 +223,13 @@ class TestCourse:
             assert (code, out, err.count("\n")) == (1, "", 1), options
             assert fact in err
         assert content(folder) == before
-        (folder / "search.pkl").write_bytes(b"broken")
-        code, _, err = cli("train", task, "--output", folder, "--resume")
-        assert (code, "no search to resume" in err) == (1, True)
+        state = folder / "search.pkl"
+        of_another_version = pickle.loads(state.read_bytes())
+        del of_another_version._widths
+        for damaged in (b"broken", pickle.dumps(of_another_version)):
+            state.write_bytes(damaged)
+            code, _, err = cli("train", task, "--output", folder, "--resume")
+            assert (code, "no search to resume" in err) == (1, True)
 
     def test_an_interruption_before_anything_is_found(self, task, tmp_path, searched, monkeypatch):
         Interruption(monkeypatch, 0)

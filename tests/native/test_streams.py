@@ -61,7 +61,7 @@ def state_of(streams, index):
     return generator_state_of(streams.states[index].tolist())
 
 
-def test_seeds_of_any_size(native):
+def test_seeds_of_any_size():
     streams = EpisodeStreams(len(SEEDS))
     streams.seed(SEEDS, np.arange(len(SEEDS)))
     for index, seed in enumerate(SEEDS):

@@ -45,7 +45,7 @@ class Layout:
             The arrays, or the only one; and the observations and infos that they hold.
         """
         arrays = tuple(np.empty((steps, *shape), dtype) for shape, dtype in self.shapes)
-        return arrays if len(arrays) > 1 else arrays[0], *self._nested(arrays)
+        return arrays[0] if len(arrays) == 1 else arrays, *self._nested(arrays)
 
     def of_one(self) -> tuple[tuple[Any, ...], Any, Callable[[Any], tuple[Any, Any]] | None]:
         """The arrays of a single environment.

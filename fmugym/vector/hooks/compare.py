@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.task import spaces as fmu_spaces
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks import hook_results
@@ -20,7 +22,7 @@ from fmugym.vector.hooks.program import (
     evaluate,
     writes_variable,
 )
-from fmugym.vector.hooks.trace import TracedTask, of_input_type
+from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.views import some
 
 __all__ = ["require_same"]
@@ -73,13 +75,23 @@ class _Comparison:
         expected = np.array(env.inputs)
         hook_results.write_inputs(env._get_inputs(), expected)
         self._require_unwritten(self._before)
-        variables = env.inside.interface.inputs
-        for row, wanted, variable in zip(self._played.inputs, expected, variables, strict=True):
-            wanted[:] = of_input_type(variable, wanted)
+        for index in range(self._count):
+            expected[:, index] = self._typed(expected[:, index])
+        for row, wanted in zip(self._played.inputs, expected, strict=True):
             if "_get_inputs" not in self._task.left:
                 self._require_equal("_get_inputs", row, wanted)
         env.inputs, env.previous_state = expected, before
         self._played.inputs[...] = expected
+
+    def _typed(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        result = values.copy()
+        for index, variable in enumerate(self._env.inside.interface.inputs):
+            one = values[index : index + 1]
+            try:
+                result[index] = fmu_spaces.to_input_types([variable], one)[0]
+            except ConfigError:
+                result[index] = np.nan
+        return result
 
     def compare_judgement(self) -> None:
         """Compare what follows the step of the FMU."""

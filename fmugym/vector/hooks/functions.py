@@ -293,6 +293,7 @@ def full_like(
     order: Any = "K",
     subok: Any = True,
     shape: Any = None,
+    device: Any = None,
 ) -> Symbols:
     """Do what ``numpy.full_like`` does."""
     graph = graph_of(a, fill_value)
