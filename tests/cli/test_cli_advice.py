@@ -287,7 +287,7 @@ class TestSolvers:
     @pytest.mark.parametrize(
         ("model", "outputs", "time_step", "parameters"),
         [
-            ("prothero", ["x"], 0.1, {"k": 1e5}),
+            ("prothero", ["x"], 0.1, {"k": 1e6}),
             ("van_der_pol", ["x1", "x2"], 10.0, {"mu": 1000.0}),
             ("robertson", ["y1", "y3"], 10.0, {}),
         ],
