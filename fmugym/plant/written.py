@@ -45,6 +45,7 @@ class Written:
         if env.inside.warm_ups is not None:
             warm_up = env.inside.warm_ups.warm_up
             self._of_warm_up = warm_up.inputs
+            # that of this one warm-up, which must wait for the plant before the first observation
             warm_up.inputs = self._warm_inputs  # type: ignore[method-assign]
 
     def _warm_inputs(self, env: Any) -> FloatArray:
