@@ -46,33 +46,29 @@ class Probe:
         agents: Controllers that the task declares and that do not plan ahead. Without any, those
             that suggest themselves, or else a constant action.
         limits: What each cost may add up to in an episode.
-        length: The steps of an episode; None if they are not limited.
+        most_steps: The steps after which an episode is stopped.
         is_same: Whether all episodes are the same.
-        only_return: What has been reached by all actions in all episodes; None if that differs.
         seconds: Real time of a step of one environment among many.
         usual_steps: The steps of an episode: of the longest one, if all have ended early.
-        left_out: The names of controllers that the task declares: they give one action, but there
-            are several.
     """
 
     task: Mapping[str, Any]
     linear: Agent
     agents: Sequence[Agent]
     limits: Mapping[str, float]
-    length: int | None
+    most_steps: int
     is_same: bool
-    only_return: float | None
     seconds: float
-    usual_steps: int = _STEPS
-    left_out: Sequence[str] = ()
+    usual_steps: int
 
     @classmethod
-    def of(cls, make_env: Callable[[], FMUEnv], envs: int) -> Probe:
+    def of(cls, make_env: Callable[[], FMUEnv], envs: int, tell: Callable[[str], None]) -> Probe:
         """Take some steps with constant actions.
 
         Args:
             make_env: A function that makes the environment.
             envs: The largest number of environments.
+            tell: Gets lines about what a user would not expect.
 
         Raises:
             ConfigError: If no policy can be searched for the task, or its first step always fails.
@@ -89,6 +85,9 @@ class Probe:
             if not plans_ahead(one)
         ]
         agents = declared if len(policy.choices or policy.limits) == 1 else []
+        if declared != agents:
+            left_out = ", ".join(one.name for one in declared)
+            tell(f"left out: {left_out}: there are several actions, and each gives one")
         linear = Agent("linear", None, len(policy.names), policy.acting)
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
@@ -104,25 +103,25 @@ class Probe:
             if arena.seconds < _QUICK * arena.steps:
                 arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
                 arena.play(linear, rows, seeds)
-        returns = outcome.returns
-        seen = np.dstack([returns, outcome.moments])
+        seen = np.dstack([outcome.returns, outcome.moments])
+        if np.ptp(outcome.returns) == 0:
+            tell(
+                f"warning: all episodes have reached {outcome.returns[0, 0]:g}, whatever the "
+                "actions: what is to be learned?"
+            )
+        if length is None:
+            tell(f"warning: episodes have no length; they are stopped after {MOST_STEPS} steps")
+        most_steps = length or MOST_STEPS
         return cls(
             task,
             linear,
             agents or [Agent("PI", one) for one in guesses] or [constant],
             limits,
-            length,
+            most_steps,
             is_same=not np.ptp(seen, axis=1).any(),
-            only_return=float(returns[0, 0]) if np.ptp(returns) == 0 else None,
             seconds=arena.seconds / arena.steps,
-            usual_steps=arena.longest if arena.longest < _STEPS else length or MOST_STEPS,
-            left_out=[one.name for one in declared if one not in agents],
+            usual_steps=arena.longest if arena.longest < _STEPS else most_steps,
         )
-
-    @property
-    def most_steps(self) -> int:
-        """The steps after which an episode is stopped."""
-        return self.length or MOST_STEPS
 
     def round_time(self, episodes: int) -> float:
         """About how many seconds a round of a controller takes, until episodes become longer."""

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, Merit
+from fmugym.baselines.arena import Arena
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
@@ -135,7 +135,8 @@ class Search:
             self._play(self.tuning, arena)
         elif self._widths:
             if self.baseline is None:
-                known = _scored(arena, self._fixed, self._seeds(VALIDATION))
+                seeds = self._seeds(VALIDATION)
+                known = [(one, one.play(arena, seeds).merits[0]) for one in self._fixed]
                 known += [(one.best, one.merit) for one in self._tuned]
                 self.best, self.merit = self.baseline, self.merit_of_baseline = max(
                     known, key=itemgetter(1)
@@ -170,16 +171,13 @@ class Search:
             leader.then = None
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
-        entrant.play(arena, self._training(entrant.episodes))
+        entrant.play(arena, self._rng.integers(VALIDATION, size=entrant.episodes).tolist())
         self.rounds += 1
         entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
             entrant.validate(arena, self._seeds(VALIDATION))
             if entrant.merit > self.merit:
                 self.best, self.merit = entrant.best, entrant.merit
-
-    def _training(self, count: int) -> list[int]:
-        return list(map(int, self._rng.integers(VALIDATION, size=count)))
 
     def _seeds(self, first: int, count: int = _VALIDATED) -> range:
         """Seeds of a validation; one is enough if all episodes are the same."""
@@ -213,7 +211,8 @@ class Search:
         agent = replace(history, text=baseline.text, scale=self._scale)
         sizes = np.geomspace(1.0, _FINEST, _RANDOM)[:, None]
         drawn = self._rng.standard_normal((_RANDOM, self._widths.pop()))
-        rows, seeds = agent.extended(sizes * drawn), self._training(self.episodes)
+        rows = agent.extended(sizes * drawn)
+        seeds = self._rng.integers(VALIDATION, size=self.episodes).tolist()
         outcome = arena.play(agent, rows, seeds, has_moments=True)
         self.rounds += 1
         best = outcome.moments[outcome.order[: _RANDOM // _BEST_PART]]
@@ -259,11 +258,4 @@ class Search:
     def winner(self, arena: Arena) -> Agent | None:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
-        return max(_scored(arena, agents, seeds), key=itemgetter(1))[0] if agents else None
-
-
-def _scored(
-    arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]
-) -> list[tuple[Agent, Merit]]:
-    """Agents, and what they are worth in the same episodes."""
-    return [(one, one.play(arena, seeds).merits[0]) for one in agents]
+        return max(agents, key=lambda one: one.play(arena, seeds).merits[0], default=None)

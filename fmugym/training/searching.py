@@ -124,21 +124,7 @@ class Searching:
             raise ConfigError(
                 f"{self.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
             )
-        probe = Probe.of(self.make_env, self.envs)
-        if probe.left_out:
-            self.tell(
-                f"left out: {', '.join(probe.left_out)}: there are several actions, and each "
-                "gives one"
-            )
-        if probe.only_return is not None:
-            self.tell(
-                f"warning: all episodes have reached {probe.only_return:g}, whatever the actions: "
-                "what is to be learned?"
-            )
-        if probe.length is None:
-            self.tell(
-                f"warning: episodes have no length; they are stopped after {probe.most_steps} steps"
-            )
+        probe = Probe.of(self.make_env, self.envs, self.tell)
         agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
         self.tell(f"to be beaten: {', '.join(dict.fromkeys(agents))}")
         self.folder.mkdir(parents=True, exist_ok=True)

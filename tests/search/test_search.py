@@ -723,7 +723,7 @@ def test_a_process_that_constants_drive_away_can_be_controlled(tmp_path):
     with closing(make()) as env:
         feedback = SimpleNamespace(act=lambda x, _: np.clip(-gains @ x, -1, 1))
         by_feedback, _, _ = episode(env, feedback, 0)
-    search = Search(Probe.of(make, 256), 0)
+    search = Search(Probe.of(make, 256, print), 0)
     with closing(Arena(make)) as arena:
         while search.rounds < 60:
             search.advance(arena)
@@ -852,7 +852,7 @@ CONSTANT = Agent("constant action", acting=1)
 
 def search_of_agents(*agents):
     """A search with ready agents for two observations and one action."""
-    return Search(Probe({}, Agent("linear", None, 2, 1), agents, {}, 40, False, None, 0.0), 0)
+    return Search(Probe({}, Agent("linear", None, 2, 1), agents, {}, 40, False, 0.0, 40), 0)
 
 
 def test_only_the_best_controller_is_tuned_to_the_end():
@@ -1372,23 +1372,24 @@ class TestProbe:
     @pytest.mark.parametrize("envs", [1, 3, 8])
     def test_what_it_finds_depends_on_no_time(self, envs, monkeypatch):
         """Episodes differ after the first steps only; a step seems to take 100 s, or nothing."""
-        found = []
+        found, told = [], []
         for seconds in (100.0, 0.0):
             clock = itertools.count(step=seconds)
             monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
-            found.append(Probe.of(load(parameters=HIDDEN), envs))
+            found.append(Probe.of(load(parameters=HIDDEN), envs, told.append))
         slow, fast = found
         assert slow.seconds > fast.seconds
         assert replace(slow, seconds=fast.seconds) == fast
-        assert (slow.is_same, slow.only_return) == (False, None)
+        assert not slow.is_same
+        assert not told
 
     @pytest.mark.parametrize(("end", "steps"), [("n >= 9", 9), ("n > 99", 40), (None, 40)])
     def test_a_round_takes_as_long_as_episodes_have_taken(self, end, steps):
-        probe = Probe.of(load(terminated=end, memory=COUNTED), 8)
+        probe = Probe.of(load(terminated=end, memory=COUNTED), 8, print)
         assert probe.round_time(4) == pytest.approx(probe.seconds * steps * 8 * 4)
 
     def test_of_longer_episodes_the_limit_counts(self):
-        probe = Probe.of(load(terminated=None, episode_length="10s"), 8)
+        probe = Probe.of(load(terminated=None, episode_length="10s"), 8, print)
         assert probe.round_time(1) == pytest.approx(probe.seconds * 200 * 8)
 
     def test_a_reward_that_is_always_nan_is_refused(self, tmp_path):
@@ -1398,4 +1399,4 @@ class TestProbe:
         assert not (tmp_path / "agent").exists()
 
     def test_a_reward_that_is_nan_later_is_none_of_its_business(self):
-        Probe.of(load(reward="log(1.5 - n)", memory=COUNTED), 8)
+        Probe.of(load(reward="log(1.5 - n)", memory=COUNTED), 8, print)
