@@ -245,7 +245,7 @@ class Pool:
         complete: Callable[[Any], Any] | None,
         watched: tuple[Any, ...],
         action: Any,
-        attributes: dict[str, Any],
+        environment: Any,
         /,
     ) -> Any:
         """Do a whole step of a single environment, by a pool of one.
@@ -258,7 +258,7 @@ class Pool:
             watched: The attributes that the programs were made of: names and values after each
                 other. An ellipsis stands for one that must not be there.
             action: Of the environment.
-            attributes: Of the environment.
+            environment: Whose attributes are compared.
 
         Returns:
             The result of the step: a tuple of the class that ``prepare_play`` has got. None if

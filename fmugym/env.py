@@ -258,7 +258,7 @@ class FMUEnv(Constructed):
         """
         player = self.inside.player
         if player is not None and self.render_mode is None:
-            result: Result | None = player.step(action, self.__dict__)
+            result: Result | None = player.step(action, self)
             if result is not None:
                 return result
         return self.inside.guard.run("step", FMUEnv._step, self, action)

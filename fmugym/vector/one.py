@@ -70,14 +70,14 @@ class Player:
 
     Attributes:
         readings: What hooks read from the pool's arrays.
-        step: Does a step by an action and the attributes of the environment; see
+        step: Does a step by an action and the environment; see
             ``_native.Pool.step_one``.
 
     Raises:
         UntraceableError: If one of the hooks cannot be compiled.
     """
 
-    step: Callable[[Any, dict[str, Any]], Any]
+    step: Callable[[Any, FMUEnv], Any]
 
     def __init__(self, env: FMUEnv) -> None:
         env.inside.keep()
@@ -98,7 +98,7 @@ class Player:
         memory.hold(task)
         self._task = task
         reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
-        self._parameters = frozenset(memory.parameters if reads else ())
+        self._parameters = memory.parameters if reads else {}
         shapes, form, divided = Layout(task, env, 1).of_one()
         self._complete = None if divided is None else partial(_complete, divided)
         memory.prepare(
@@ -127,9 +127,9 @@ class Player:
         """
         result = None
         if env.inside.readings is self.readings or self._take_over(env):
-            result = self.step(action, vars(env))
+            result = self.step(action, env)
         if result is None and self._renew(env) and self._take_over(env):
-            result = self.step(action, vars(env))
+            result = self.step(action, env)
         return result
 
     # From Python to the pool and back.
@@ -142,7 +142,7 @@ class Player:
         """
         if env.inside.ended:
             return False
-        if any(one.has_changed() for one in self._may_change) and not self._renew(env):
+        if any(map(Watched.has_changed, self._may_change)) and not self._renew(env):
             return False
         own, memory = self._own, self._memory
         none = env.inside.no_action
@@ -152,9 +152,10 @@ class Player:
             for row, action in zip(memory.actions, (own.action, own.previous_action), strict=True):
                 known = action is none  # an episode has begun
                 row[0] = none if known else _exactly(action, row.dtype).reshape(row.shape[1:])
-            for name in self._parameters.intersection(own.parameters):
-                number = own.parameters[name]
-                memory.parameters[name][0] = np.nan if isinstance(number, str) else number
+            for name in self._parameters:
+                if name in own.parameters:
+                    number = own.parameters[name]
+                    memory.parameters[name][0] = np.nan if isinstance(number, str) else number
         except ordinary(Exception):  # a user may have assigned anything
             return False
         self._rows.step_count[0], memory.ended[0] = own.step_count, False

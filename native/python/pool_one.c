@@ -3,7 +3,7 @@
 #include "playing.h"
 
 /* The arguments of step_one; see Pool.step_one in fmugym/_native.pyi. */
-enum { GUARD, JUDGE, COMPLETE, WATCHED, ACTION, ATTRIBUTES, ARGUMENTS };
+enum { GUARD, JUDGE, COMPLETE, WATCHED, ACTION, ENVIRONMENT, ARGUMENTS };
 
 typedef struct {
     PyTurn turn;
@@ -13,14 +13,17 @@ typedef struct {
 
 /* Whether the environment still has the attributes that the programs were made of: names and values
  * after each other. An ellipsis stands for one that it must not have. */
-static bool is_as_before(PyObject *watched, PyObject *attributes) {
-    bool same = true;
+static bool is_as_before(PyObject *watched, PyObject *environment) {
+    const Py_ssize_t size = PyTuple_Size(watched);
+    PyObject *attributes = PyObject_GenericGetDict(environment, NULL);
+    bool same = attributes != NULL;
 
-    for (Py_ssize_t i = 0; i + 1 < PyTuple_Size(watched) && same; i += 2) {
+    for (Py_ssize_t i = 0; i + 1 < size && same; i += 2) {
         PyObject *value = PyTuple_GetItem(watched, i + 1);
         PyObject *found = PyDict_GetItemWithError(attributes, PyTuple_GetItem(watched, i));
         same = found == (value == Py_Ellipsis ? NULL : value);
     }
+    Py_XDECREF(attributes);
     return same;
 }
 
@@ -80,7 +83,7 @@ static PyObject *step_with(PyPool *self, const Playing *playing, PyObject *const
     PyObject *result = NULL;
 
     clear_turn(playing, &s.turn);
-    s.is_refused = *ended || !is_as_before(args[WATCHED], args[ATTRIBUTES]) ||
+    s.is_refused = *ended || !is_as_before(args[WATCHED], args[ENVIRONMENT]) ||
                    !take_action(playing, args[ACTION], &s);
     PyErr_Clear();
     if (results_provide_step(playing->results, &arrays)) {
@@ -105,8 +108,8 @@ PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs)
         return NULL;
     }
     if (self->pool.settings.count != 1 || !PyObject_TypeCheck(args[GUARD], guard_type) ||
-        !PyTuple_Check(args[WATCHED]) || !PyDict_Check(args[ATTRIBUTES])) {
-        PyErr_SetString(PyExc_TypeError, "step_one needs a guard, a tuple, a dict, one instance");
+        !PyTuple_Check(args[WATCHED])) {
+        PyErr_SetString(PyExc_TypeError, "step_one needs a guard, a tuple, one instance");
         return NULL;
     }
     PyObject *capsule = Py_NewRef(self->playing);

@@ -220,10 +220,10 @@ def test_observations_that_are_numbers():
 def test_a_pool_steps_one_environment_only_with_what_that_takes(make_envs):
     env, envs = with_hooks(Side, "compiled"), make_envs(Side, 2, hooks="compiled")
     guard, action = make_guard(), np.zeros(1, np.float32)
-    good = [guard, int, None, (), action, {}]
+    good = [guard, int, None, (), action, env]
     env.reset(seed=1)
     envs.reset(seed=1)
-    for place, wrong in ((0, None), (3, []), (5, [])):
+    for place, wrong in ((0, None), (3, [])):
         with pytest.raises(TypeError, match="needs a guard"):
             env.inside.pool.step_one(*good[:place], wrong, *good[place + 1 :])
     with pytest.raises(TypeError, match="one instance"):
