@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import Arena, Merit
-from fmugym.baselines.cma import CMA
 from fmugym.baselines.controller import FloatArray
 
 __all__ = ["NO_MERIT", "Entrant"]
@@ -31,7 +30,7 @@ class Entrant:
     """One search, and what has come of it.
 
     Attributes:
-        cma: The search.
+        cma: The search, a ``CMA``; None for a controller whose numbers are known.
         make: Makes a controller for N environments from their numbers, shape (N, n). For
             validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.
@@ -49,7 +48,7 @@ class Entrant:
         last_round: The round of the whole search in which it played last.
     """
 
-    cma: CMA
+    cma: Any
     make: Any
     episodes: int
     then: Any = None

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from operator import itemgetter
-from typing import Final
+from operator import attrgetter
+from typing import Any, Final
 
 import numpy as np
 
 from fmugym.baselines.arena import Arena
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import NO_MERIT, Entrant
+from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
@@ -66,6 +66,8 @@ _LARGEST: Final = 30.0
 _GROWTH: Final = 5.0
 """Steps become so many times as large as the first ones, at most."""
 
+_MERIT: Final = attrgetter("merit")
+
 _OF_NETWORKS: Final = 4.0
 _OF_CORRECTIONS: Final = 0.4
 """The first steps of the weights are 1, so many times as large in networks, and where they correct
@@ -84,10 +86,8 @@ class Search:
         episodes: How many each candidate plays in the first rounds.
         rounds: How many there have been.
         steps: Those of all environments until the search was last saved.
-        best: The best agent in validation, once there is one.
-        merit: Its merit.
-        baseline: The best agent without a network, once it is known.
-        merit_of_baseline: Its merit.
+        controllers: Those to be beaten.
+        baseline: The best one of them, once it is known.
     """
 
     def __init__(self, probe: Probe, seed: int) -> None:
@@ -95,14 +95,16 @@ class Search:
         self.episodes = 1 if probe.is_same else _EPISODES
         self.rounds, self.steps = 0, MOST_PROBED
         self._rng = np.random.default_rng(seed)
-        self._fixed = [one for one in probe.agents if one.is_found]
-        self._tuned = [self._entrant(one) for one in probe.agents if not one.is_found]
-        self._contenders: list[Entrant] = []
+        self.controllers = [
+            Entrant(None, one, self.episodes, rounds=_TUNING, best=one)
+            if one.is_found
+            else self._entrant(one)
+            for one in probe.agents
+        ]
+        self.baseline: Any = None
+        self._policies: list[Entrant] = []
         self._scale = probe.linear.scale
         self._widths = [probe.linear.size, probe.linear.acting]
-        self.best: Agent | None = None
-        self.baseline: Agent | None = None
-        self.merit = self.merit_of_baseline = NO_MERIT
 
     @property
     def is_over(self) -> bool:
@@ -112,20 +114,20 @@ class Search:
     @property
     def tuning(self) -> Entrant | None:
         """The controller whose numbers are sought next, at last those of the best one alone."""
-        new = min(self._tuned, key=lambda one: one.rounds, default=None)
-        if new is None or new.rounds < _TRIAL:
-            return new
-        best = max(self._tuned, key=lambda one: one.merit)
-        return best if best.rounds < _TUNING else None
+        new = min(self.controllers, key=attrgetter("rounds"))
+        best = max(self.controllers, key=_MERIT)
+        found = new if new.rounds < _TRIAL else best
+        return found if found.rounds < _TUNING else None
 
     @property
     def _active(self) -> list[Entrant]:
         """The classes of policies that have not gone."""
-        return [one for one in self._contenders if one.starts < _STARTS]
+        return [one for one in self._policies if one.starts < _STARTS]
 
-    def others(self) -> list[Agent]:
-        """The controllers that were declared, and have numbers now."""
-        return [*self._fixed, *(one.best for one in self._tuned if one.best)]
+    @property
+    def ahead(self) -> Entrant:
+        """Who has the best agent in validation."""
+        return max(self.controllers + self._policies, key=_MERIT)
 
     # Rounds.
 
@@ -135,13 +137,11 @@ class Search:
             self._play(self.tuning, arena)
         elif self._widths:
             if self.baseline is None:
-                seeds = self._seeds(VALIDATION)
-                known = [(one, one.play(arena, seeds).merits[0]) for one in self._fixed]
-                known += [(one.best, one.merit) for one in self._tuned]
-                self.best, self.merit = self.baseline, self.merit_of_baseline = max(
-                    known, key=itemgetter(1)
-                )
-            self._look(arena, self.baseline)
+                for one in self.controllers:
+                    if one.cma is None:
+                        one.merit = one.best.play(arena, self._seeds(VALIDATION)).merits[0]
+                self.baseline = max(self.controllers, key=_MERIT)
+            self._look(arena, self.baseline.best)
         else:
             leaders = self._leaders()
             self._play(self._next(leaders), arena)
@@ -151,13 +151,13 @@ class Search:
 
     def _leaders(self) -> list[Entrant]:
         """The best two; one that is not better than the baseline leads only if none is."""
-        ranked = sorted(self._active, key=lambda one: one.merit, reverse=True)
-        return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[:2]
+        ranked = sorted(self._active, key=_MERIT, reverse=True)
+        return ([one for one in ranked if one.merit > self.baseline.merit] or ranked)[:2]
 
     def _next(self, leaders: Sequence[Entrant]) -> Entrant:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
         behind = [one for one in self._active if one.rounds < self.rounds // _SHARE]
-        return behind[0] if behind else min(leaders, key=lambda one: one.last_round)
+        return behind[0] if behind else min(leaders, key=attrgetter("last_round"))
 
     def _change(self, leader: Entrant) -> None:
         """Give a leader that gains nothing a new start with more episodes; it may be its last."""
@@ -167,7 +167,7 @@ class Search:
         leader.gained = leader.rounds
         if leader.then is not None:
             (start,) = leader.then.extended(leader.best.weights[None])
-            self._contenders.append(self._entrant(leader.then.with_numbers(start)))
+            self._policies.append(self._entrant(leader.then.with_numbers(start)))
             leader.then = None
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
@@ -176,8 +176,6 @@ class Search:
         entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
             entrant.validate(arena, self._seeds(VALIDATION))
-            if entrant.merit > self.merit:
-                self.best, self.merit = entrant.best, entrant.merit
 
     def _seeds(self, first: int, count: int = _VALIDATED) -> range:
         """Seeds of a validation; one is enough if all episodes are the same."""
@@ -230,8 +228,8 @@ class Search:
         for text in dict.fromkeys((baseline.text, None)):
             prefix = f"{baseline.name} + " if text else ""
             pair = (replace(one, name=prefix + one.name, text=text) for one in linear_ones)
-            self._contenders.append(self._entrant(*pair))
-        self._contenders.append(self._entrant(network))
+            self._policies.append(self._entrant(*pair))
+        self._policies.append(self._entrant(network))
 
     # Who wins.
 
@@ -242,15 +240,14 @@ class Search:
         present mean. That may be better, without having shown it in the fewer episodes of earlier
         validations.
         """
-        if self.baseline is None:
-            agents, searches = list(self._fixed), self._tuned
-        else:
-            agents = [self.baseline]
-            searches = sorted(self._contenders, key=lambda one: one.merit, reverse=True)[:2]
+        agents, searches = [], self.controllers
+        if self.baseline:
+            agents.append(self.baseline.best)
+            searches = sorted(self._policies, key=_MERIT, reverse=True)[:2]
         for one in searches:
             if one.best:
                 agents.append(one.best)
-            if one.rounds:
+            if one.cma and one.rounds:
                 agents.append(one.make.with_numbers(one.cma.mean))
         most = self.rounds * FEW * self.episodes // (_PART * (len(agents) or 1))
         return agents, self._seeds(_FINAL, min(_LAST, max(self.episodes, most)))

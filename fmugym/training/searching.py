@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
+from fmugym.baselines.entrants import NO_MERIT
 from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
@@ -189,8 +190,8 @@ class Searching:
         try:
             self._go_on()
         finally:
-            if self._found.best is not None:
-                self._save(self._found.best)
+            if self._found.ahead.merit > NO_MERIT:
+                self._save(self._found.ahead.best)
         self.tell(self._text())
         self._arena.ceiling = self.steps
         winner = self._found.winner(self._arena)
@@ -220,10 +221,11 @@ class Searching:
             if self._arena.steps > self.steps - self._reserved(found):
                 return
             self._found = found
-            if found.baseline and (before.baseline is None or found.merit > before.merit):
-                row = self._arena.steps, found.merit[1], found.merit_of_baseline[1]
+            ahead, base = found.ahead, found.baseline
+            if base and (before.baseline is None or ahead.merit > before.ahead.merit):
+                row = self._arena.steps, ahead.merit[1], base.merit[1]
                 note(self.folder, ("steps", "reward", "baseline"), row)
-                self._save(found.best)
+                self._save(ahead.best)
             took = monotonic() - begin
             longest = max(longest, took)
             self.advance(took, self._text())
@@ -246,10 +248,10 @@ class Searching:
 
     def _text(self) -> str:
         """The scores, for a line of progress."""
-        found = self._found
-        best = f", best {found.merit[1]:.6g}" if found.best else ""
-        base = f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}" if found.baseline else ""
-        return f"round {found.rounds}{best}{base}"
+        ahead, base = self._found.ahead, self._found.baseline
+        text = f"round {self._found.rounds}"
+        text += f", best {ahead.merit[1]:.6g}" if ahead.merit > NO_MERIT else ""
+        return text + (f", {base.best.name} {base.merit[1]:.6g}" if base else "")
 
     def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
@@ -259,7 +261,7 @@ class Searching:
         facts = {
             "algorithm": "search",
             "agent": agent.name,
-            "baseline": (found.baseline or agent).name,
+            "baseline": found.baseline.best.name if found.baseline else agent.name,
             "controller": agent.text,
             "rounds": found.rounds,
             "seed": found.seed,
@@ -275,9 +277,9 @@ class Searching:
     def _judged(self, winner: Agent) -> dict[str, Any]:
         """Let the winner play beside the others, and write what it has reached."""
         probe, found = self._probe, self._found
-        if winner is found.baseline:
+        baseline = found.baseline.best if found.baseline else winner
+        if found.baseline and winner is baseline:
             self.tell(f"nothing was found that beats {winner.name}: the folder has that controller")
-        baseline = found.baseline or winner
         arenas = {
             name: self._arena_of(make, probe.most_steps if make is self.make_env else _LONGEST)
             for name, make in self.scenarios.items()
@@ -286,7 +288,8 @@ class Searching:
         count = 1 if probe.is_same else self.episodes or usual
         agents = {winner.name: winner}
         planners = self._planners(baseline.text, count * len(arenas))
-        for other in [baseline, *found.others(), *planners]:
+        tuned = (one.best for one in found.controllers)
+        for other in filter(None, [baseline, *tuned, *planners]):
             agents.setdefault(other.name, other)
         test = judge(agents, arenas, count)
         return self._save(winner, test=test, verdict=verdict(test, probe.limits))

@@ -727,7 +727,7 @@ def test_a_process_that_constants_drive_away_can_be_controlled(tmp_path):
     with closing(Arena(make)) as arena:
         while search.rounds < 60:
             search.advance(arena)
-    assert search.merit[1] > 1.7 * by_feedback
+    assert search.ahead.merit[1] > 1.7 * by_feedback
 
 
 def test_a_scale_is_that_of_all_features():
@@ -866,7 +866,7 @@ def test_only_the_best_controller_is_tuned_to_the_end():
     search, field = search_of_agents(*(Agent(name, text) for name in names)), Uneven(1.0)
     while search.tuning:
         search.advance(field)
-    assert [one.rounds for one in search._tuned] == [5, 20, 5]
+    assert [one.rounds for one in search.controllers] == [5, 20, 5]
 
 
 def test_a_search_that_gains_nothing_ends():
@@ -875,22 +875,22 @@ def test_a_search_that_gains_nothing_ends():
         search.advance(field)
         assert search.rounds < 2000
     assert search.rounds > 100
-    assert search.winner(field) is search.baseline
+    assert search.winner(field) is search.baseline.best
 
 
 def names_of(search):
-    found = [one.best for one in search._contenders if one.gained]
-    return [search.baseline.name, *(one.name for one in found)]
+    found = [one.best for one in search._policies if one.gained]
+    return [search.baseline.best.name, *(one.name for one in found)]
 
 
 def test_a_history_enters_when_a_correction_gains_nothing_without_it():
     search, field = search_of_agents(GIVEN), Field(1.0)
-    while not search._contenders:
+    while not search._policies:
         search.advance(field)
-    first = search._contenders[0]
+    first = search._policies[0]
     while first.rounds - first.gained < 14:
         search.advance(field)
-    assert [one.make.name for one in search._contenders] == ["given + linear", "linear", "network"]
+    assert [one.make.name for one in search._policies] == ["given + linear", "linear", "network"]
     while "given + linear with history" not in names_of(search):
         search.advance(field)
     assert search.rounds < 300
@@ -908,7 +908,7 @@ def test_what_the_search_has_come_to_may_win_without_an_earlier_gain():
     search, field = search_of_agents(GIVEN), Late(1.0)
     while search.rounds < 60:
         search.advance(field)
-    leader = max(search._contenders[:2], key=lambda one: one.cma.mean.sum())
+    leader = max(search._policies[:2], key=lambda one: one.cma.mean.sum())
     assert leader.best.weights.sum() < leader.cma.mean.sum()
     assert np.array_equal(search.winner(field).weights, leader.cma.mean)
 
@@ -923,7 +923,7 @@ def test_who_is_worse_than_the_baseline_has_no_more_than_its_share():
     search, field = search_of_agents(GIVEN), Uneven(1e9)
     for _ in range(200):
         search.advance(field)
-    rounds = {one.make.name: one.rounds for one in search._contenders}
+    rounds = {one.make.name: one.rounds for one in search._policies}
     assert {rounds["linear"], rounds["network"]} <= {19, 20}
     assert rounds["given + linear"] + rounds.get("given + linear with history", 0) > 140
 
