@@ -207,6 +207,8 @@ def _flat(observation: Any) -> FloatArray:
 
 def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_faults(first)
+    if first.fault is not None and len(first.rewards) == 1:
+        return  # nothing has moved: all else would only follow from that
     yield _of_repetition(env, first)
     pairs = {
         name: [_play(env, _always(value)) for value in ends]

@@ -133,8 +133,10 @@ def test_a_parameter_has_an_effect_where_an_action_moves_the_process():
 
 @pytest.mark.parametrize("reward", ["log(-1 - theta**2)", {"a": "1", "b": "0.5 / (tau - tau)"}])
 def test_a_reward_that_is_no_number_is_to_be_changed(reward):
-    (found,) = findings_of(RESTING | {"reward": reward}, "run")
-    assert found.verdict == "error"
+    """Nothing is told of what only follows from a first step that fails."""
+    _, report = advised(Task.from_dict(RESTING | {"reward": reward}))
+    (found,) = report.findings
+    assert (found.check, found.verdict) == ("run", "error")
     assert ("time step" in found.cure, "division by 0" in found.cure) == (False, True)
 
 
