@@ -3,13 +3,19 @@
 import os
 import subprocess
 import sys
+from contextlib import closing
 
 import gymnasium
 import pygame
 import pytest
 
 from fmugym.tools.cli import main
-from fmugym.tools.demo import Training
+from fmugym.tools.demo import arena_of_demo, train
+
+
+def trained(seed, most=30):
+    with closing(arena_of_demo()) as arena:
+        return [*train(arena, seed, most)]
 
 
 def length(env, controller, seed):
@@ -24,21 +30,21 @@ def length(env, controller, seed):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_what_it_learns_balances_gymnasiums_cart_pole(seed):
-    training = Training(seed)
-    *_, last = training.rounds()
+    agent, last = trained(seed)[-1]
     assert last.is_solved
-    with gymnasium.make("CartPole-v1") as env:
-        lengths = [length(env, training.controller, 7_000 + episode) for episode in range(10)]
+    with gymnasium.make("fmugym/CartPole-v0") as own, gymnasium.make("CartPole-v1") as env:
+        policy = agent.policy().bind(own)
+        lengths = [length(env, policy, 7_000 + episode) for episode in range(10)]
     assert sum(lengths) / 10 >= 450
 
 
 def test_the_same_seed_learns_the_same():
-    trainings = [Training(3), Training(3)]
-    assert [*trainings[0].rounds()] == [*trainings[1].rounds()]
+    one, other = ([shown for _, shown in trained(3)] for _ in range(2))
+    assert one == other
 
 
 def test_it_gives_up_after_the_most_rounds():
-    assert len([*Training(0, candidates=4, elites=1).rounds(most=1)]) == 1
+    assert len(trained(0, most=1)) == 1
 
 
 def test_without_a_display_it_writes_a_picture(tmp_path, capsys):
