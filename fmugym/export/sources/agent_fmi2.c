@@ -93,15 +93,17 @@ ACCESS(Real, 'd', value)
 ACCESS(Integer, 'i', value)
 ACCESS(Boolean, '?', value != 0.0)
 
-fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference references[], size_t n,
-                         fmi2String values[]) {
-    return OR_ERROR(n == 0);
-}
+/* Functions of types that no variable has, and of derivatives. */
+#define OF_NONE(name, ...)                                                                         \
+    fmi2Status name(fmi2Component c, const fmi2ValueReference references[], size_t n,              \
+                    __VA_ARGS__) {                                                                 \
+        return OR_ERROR(n == 0);                                                                   \
+    }
 
-fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference references[], size_t n,
-                         const fmi2String values[]) {
-    return OR_ERROR(n == 0);
-}
+OF_NONE(fmi2GetString, fmi2String values[])
+OF_NONE(fmi2SetString, const fmi2String values[])
+OF_NONE(fmi2SetRealInputDerivatives, const fmi2Integer orders[], const fmi2Real values[])
+OF_NONE(fmi2GetRealOutputDerivatives, const fmi2Integer orders[], fmi2Real values[])
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
     return OR_ERROR(remember((Controller *)c, state));
@@ -140,17 +142,6 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
                                         size_t n, const fmi2ValueReference knowns[], size_t m,
                                         const fmi2Real seed[], fmi2Real sensitivity[]) {
     return fmi2Error;
-}
-
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference references[],
-                                       size_t n, const fmi2Integer orders[],
-                                       const fmi2Real values[]) {
-    return OR_ERROR(n == 0);
-}
-
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference references[],
-                                        size_t n, const fmi2Integer orders[], fmi2Real values[]) {
-    return OR_ERROR(n == 0);
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_set_state) {

@@ -158,197 +158,71 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 size, fmi3Bo
     return OR_ERROR(done);
 }
 
-/* What a controller does not have */
+/* What a controller does not have: functions that fail, and those of values that it has none of. */
 
-fmi3Status fmi3EnterEventMode(fmi3Instance c) {
-    return fmi3Error;
-}
+#define LACKING(name, ...)                                                                         \
+    fmi3Status name(__VA_ARGS__) {                                                                 \
+        return fmi3Error;                                                                          \
+    }
+#define OF_NONE(name, ...)                                                                         \
+    fmi3Status name(fmi3Instance c, const fmi3ValueReference references[], size_t n,               \
+                    __VA_ARGS__) {                                                                 \
+        return OR_ERROR(n == 0);                                                                   \
+    }
 
-fmi3Status fmi3GetString(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, fmi3String values[], size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, size_t valueSizes[], fmi3Binary values[],
-                         size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                        size_t nValueReferences, fmi3Clock values[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetString(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, const fmi3String values[], size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, const size_t valueSizes[],
-                         const fmi3Binary values[], size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                        size_t nValueReferences, const fmi3Clock values[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference valueReference,
-                                               size_t *nDependencies) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference dependent,
-                                       size_t elementIndicesOfDependent[],
-                                       fmi3ValueReference independents[],
-                                       size_t elementIndicesOfIndependents[],
-                                       fmi3DependencyKind dependencyKinds[],
-                                       size_t nDependencies) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
-                                        size_t nUnknowns, const fmi3ValueReference knowns[],
-                                        size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                        fmi3Float64 sensitivity[], size_t nSensitivity) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
-                                    size_t nUnknowns, const fmi3ValueReference knowns[],
-                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                  size_t nValueReferences, fmi3Float64 intervals[],
-                                  fmi3IntervalQualifier qualifiers[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                   size_t nValueReferences, fmi3UInt64 counters[],
-                                   fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                               size_t nValueReferences, fmi3Float64 shifts[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                size_t nValueReferences, fmi3UInt64 counters[],
-                                fmi3UInt64 resolutions[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                  size_t nValueReferences, const fmi3Float64 intervals[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                   size_t nValueReferences, const fmi3UInt64 counters[],
-                                   const fmi3UInt64 resolutions[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                               size_t nValueReferences, const fmi3Float64 shifts[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                size_t nValueReferences, const fmi3UInt64 counters[],
-                                const fmi3UInt64 resolutions[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *discreteStatesNeedUpdate,
-                                    fmi3Boolean *terminateSimulation,
-                                    fmi3Boolean *nominalsOfContinuousStatesChanged,
-                                    fmi3Boolean *valuesOfContinuousStatesChanged,
-                                    fmi3Boolean *nextEventTimeDefined,
-                                    fmi3Float64 *nextEventTime) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c,
-                                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
-                                       fmi3Boolean *enterEventMode,
-                                       fmi3Boolean *terminateSimulation) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 continuousStates[],
-                                   size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 derivatives[],
-                                             size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 eventIndicators[],
-                                  size_t nEventIndicators) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 continuousStates[],
-                                   size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominals[],
-                                             size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *nEventIndicators) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3EnterStepMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                    size_t nValueReferences, const fmi3Int32 orders[],
-                                    fmi3Float64 values[], size_t nValues) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference clockReference,
-                                      fmi3Float64 activationTime) {
-    return fmi3Error;
-}
+LACKING(fmi3EnterEventMode, fmi3Instance c)
+OF_NONE(fmi3GetString, fmi3String values[], size_t nValues)
+OF_NONE(fmi3GetBinary, size_t valueSizes[], fmi3Binary values[], size_t nValues)
+OF_NONE(fmi3GetClock, fmi3Clock values[])
+OF_NONE(fmi3SetString, const fmi3String values[], size_t nValues)
+OF_NONE(fmi3SetBinary, const size_t valueSizes[], const fmi3Binary values[], size_t nValues)
+OF_NONE(fmi3SetClock, const fmi3Clock values[])
+LACKING(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference valueReference,
+        size_t *nDependencies)
+LACKING(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
+        size_t elementIndicesOfDependent[], fmi3ValueReference independents[],
+        size_t elementIndicesOfIndependents[], fmi3DependencyKind dependencyKinds[],
+        size_t nDependencies)
+LACKING(fmi3GetDirectionalDerivative, fmi3Instance c, const fmi3ValueReference unknowns[],
+        size_t nUnknowns, const fmi3ValueReference knowns[], size_t nKnowns,
+        const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[], size_t nSensitivity)
+LACKING(fmi3GetAdjointDerivative, fmi3Instance c, const fmi3ValueReference unknowns[],
+        size_t nUnknowns, const fmi3ValueReference knowns[], size_t nKnowns,
+        const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[], size_t nSensitivity)
+LACKING(fmi3EnterConfigurationMode, fmi3Instance c)
+LACKING(fmi3ExitConfigurationMode, fmi3Instance c)
+OF_NONE(fmi3GetIntervalDecimal, fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
+OF_NONE(fmi3GetIntervalFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[],
+        fmi3IntervalQualifier qualifiers[])
+OF_NONE(fmi3GetShiftDecimal, fmi3Float64 shifts[])
+OF_NONE(fmi3GetShiftFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[])
+OF_NONE(fmi3SetIntervalDecimal, const fmi3Float64 intervals[])
+OF_NONE(fmi3SetIntervalFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+OF_NONE(fmi3SetShiftDecimal, const fmi3Float64 shifts[])
+OF_NONE(fmi3SetShiftFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+LACKING(fmi3EvaluateDiscreteStates, fmi3Instance c)
+LACKING(fmi3UpdateDiscreteStates, fmi3Instance c, fmi3Boolean *discreteStatesNeedUpdate,
+        fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,
+        fmi3Boolean *valuesOfContinuousStatesChanged, fmi3Boolean *nextEventTimeDefined,
+        fmi3Float64 *nextEventTime)
+LACKING(fmi3EnterContinuousTimeMode, fmi3Instance c)
+LACKING(fmi3CompletedIntegratorStep, fmi3Instance c, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+        fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation)
+LACKING(fmi3SetTime, fmi3Instance c, fmi3Float64 time)
+LACKING(fmi3SetContinuousStates, fmi3Instance c, const fmi3Float64 continuousStates[],
+        size_t nContinuousStates)
+LACKING(fmi3GetContinuousStateDerivatives, fmi3Instance c, fmi3Float64 derivatives[],
+        size_t nContinuousStates)
+LACKING(fmi3GetEventIndicators, fmi3Instance c, fmi3Float64 eventIndicators[],
+        size_t nEventIndicators)
+LACKING(fmi3GetContinuousStates, fmi3Instance c, fmi3Float64 continuousStates[],
+        size_t nContinuousStates)
+LACKING(fmi3GetNominalsOfContinuousStates, fmi3Instance c, fmi3Float64 nominals[],
+        size_t nContinuousStates)
+LACKING(fmi3GetNumberOfEventIndicators, fmi3Instance c, size_t *nEventIndicators)
+LACKING(fmi3GetNumberOfContinuousStates, fmi3Instance c, size_t *nContinuousStates)
+LACKING(fmi3EnterStepMode, fmi3Instance c)
+LACKING(fmi3GetOutputDerivatives, fmi3Instance c, const fmi3ValueReference valueReferences[],
+        size_t nValueReferences, const fmi3Int32 orders[], fmi3Float64 values[], size_t nValues)
+LACKING(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clockReference,
+        fmi3Float64 activationTime)
