@@ -196,10 +196,10 @@ class _Source:
         if number in self._logic.loads:
             return self._loaded(number, node)
         operands = [self._texts[operand] for operand in node.operands]
-        letters = "".join(self._graph.nodes[operand].dtype.char for operand in node.operands)
         match node.kind:
             case "ufunc":
-                return expression(node.what, operands, letters, self._use)
+                dtype = self._graph.nodes[node.operands[0]].dtype
+                return expression(node.what, operands, dtype, self._use)
             case "cast":
                 return self._cast(node, operands[0])
             case "where":
@@ -267,8 +267,7 @@ class _Source:
 
     def _helper_lines(self) -> Iterator[str]:
         for (helper, letter), name in self._helpers.items():
-            suffix = "f" if letter == "f" else ""
-            yield "static " + HELPERS[helper].format(T=TYPES[letter], name=name, f=suffix)
+            yield "static " + HELPERS[helper].format(T=TYPES[letter], name=name)
             yield ""
 
     def _init(self) -> Iterator[str]:
