@@ -16,8 +16,8 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
-from fmugym.series.choice import choose
-from fmugym.series.rows import Episodes, Infos, Outcome, Rows, batched, present
+from fmugym.series.choice import Episodes, choose
+from fmugym.series.rows import Infos, Outcome, Rows, batched
 from fmugym.series.store import Block, Memory, Store, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
@@ -31,7 +31,6 @@ class _Recorder:
     Args:
         episodes: The environments.
         variables, environments, every, path, most_rows: See the wrappers.
-        is_vector: Whether there may be many.
     """
 
     def __init__(
@@ -42,9 +41,8 @@ class _Recorder:
         every: float | None,
         path: str | os.PathLike[str] | None,
         most_rows: int,
-        is_vector: bool,
     ) -> None:
-        self.episodes, self._is_vector = episodes, is_vector
+        self.episodes = episodes
         patterns = [variables] if isinstance(variables, str) else variables
         self._choice = choose(episodes.prototype, patterns)
         self._indices = _chosen(environments, episodes.count)
@@ -69,9 +67,7 @@ class _Recorder:
         if self._memory is not None:
             return
         self.has_begun = True
-        self._rows = Rows(
-            self.episodes, self._choice, self._indices, self._every, self._is_vector, infos
-        )
+        self._rows = Rows(self.episodes, self._choice, self._indices, self._every, infos)
         if self._steps is not None:
             self._rows.go_on(self._steps)
         if self._path is not None:
@@ -86,8 +82,8 @@ class _Recorder:
         self._add(self._rows.add(outcome, idle))
 
     def present(self) -> FloatArray:
-        """What the environments have at this moment; see ``Rows.present``."""
-        return present(self.episodes, self._choice, self._indices)
+        """What the environments have at this moment; see ``Choice.present``."""
+        return self._choice.present(self.episodes, self._indices)
 
     def _add(self, block: Block) -> None:
         for store in self._stores if len(block) else ():
@@ -131,6 +127,8 @@ def _steps_of(every: float | None, time_step: float) -> int:
 
 class _One:
     """A single environment, as ``Episodes``."""
+
+    is_vector = False
 
     def __init__(self, env: FMUEnv) -> None:
         self.prototype, self.count = env, 1
@@ -181,7 +179,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not isinstance(inner, FMUEnv):
             raise ConfigError(f"steps of an FMUEnv can be recorded, got {shown(env)}")
         super().__init__(env)
-        self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows, False)
+        self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows)
 
     @property
     def series(self) -> TimeSeries:
@@ -228,6 +226,8 @@ def _batch(observation: Any) -> Any:
 class _Many:
     """The environments of a vector environment, as ``Episodes``."""
 
+    is_vector = True
+
     def __init__(self, envs: FMUVectorEnv) -> None:
         self._inside, self.prototype, self.count = envs.inside, envs.inside.prototype, envs.num_envs
         self.actions: Any = np.zeros(envs.action_space.shape, envs.action_space.dtype)
@@ -271,9 +271,7 @@ class RecordVectorSeries(VectorWrapper):
         super().__init__(env)
         self._mode, self._envs = env.autoreset_mode, _Many(env)
         self._ended = np.zeros(env.num_envs, np.bool_)
-        self._recorder = _Recorder(
-            self._envs, variables, environments, every, path, most_rows, True
-        )
+        self._recorder = _Recorder(self._envs, variables, environments, every, path, most_rows)
         self._at_end: FloatArray | None = None
         if self._mode is AutoresetMode.SAME_STEP:
             env.inside.look_at_ends(self._look)
