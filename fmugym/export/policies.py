@@ -131,10 +131,10 @@ def _require_flat(extractor: Any) -> None:
         raise ConfigError(f"a policy whose features come from {names} cannot be exported")
 
 
-def _scaling(normalization: Any, space: spaces.Space[Any]) -> Scaling:
+def _scaling(normalization: Any, space: Any) -> Scaling:
     """The normalization of each element of an observation, parts of dicts side by side."""
     is_dict, rms = isinstance(space, spaces.Dict), normalization.obs_rms
-    parts, known = (dict(space), rms) if is_dict else ({"": space}, {"": rms})  # type: ignore[call-overload]  # as it is one
+    parts, known = (dict(space), rms) if is_dict else ({"": space}, {"": rms})
     rows = []
     for name, part in parts.items():
         row = [0.0, 1.0, np.inf]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -58,7 +58,8 @@ class _Trials(NamedTuple):
 
     def take(self, places: IndexArray) -> _Trials:
         """Some of them."""
-        return _Trials(*(part[places] for part in self))
+        parts: Iterator[Any] = (part[places] for part in self)
+        return _Trials(*parts)
 
 
 def differentiate_by_starts(
