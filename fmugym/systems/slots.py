@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
@@ -118,10 +118,11 @@ class Layout:
         ins += [(e.part, e.variable) for v in inputs for e in self.ends_of(v)]
         outs = [self._end(link.source, link.output) for link in self.plan.links]
         outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
+        own_inputs, own_outputs = _by_part(ins), _by_part(outs)
         for index, part in enumerate(self.parts):
             part.first_input, part.first_output = len(self._input_slots), len(self._output_slots)
-            part.inputs = _filled(self._input_slots, index, ins)
-            part.outputs = _filled(self._output_slots, index, outs)
+            part.inputs = _filled(self._input_slots, index, own_inputs[index])
+            part.outputs = _filled(self._output_slots, index, own_outputs[index])
 
     def _end(self, component: str, name: str) -> tuple[int, Variable]:
         part = self._numbers[component]
@@ -175,13 +176,9 @@ class Layout:
 
     def inner_routes(self, group: Group) -> tuple[int, ...]:
         """The routes within a group."""
-        inside = set(self.parts_of(group))
-        found = (index for part in inside for index in self.routes_into(part))
+        inside, into = set(self.parts_of(group)), self._routes_by_target
+        found = (index for part in inside for index in into.get(part, ()))
         return tuple(sorted(i for i in found if self.routes[i].source_part in inside))
-
-    def routes_into(self, part: int) -> Sequence[int]:
-        """The routes that end at a component."""
-        return self._routes_by_target.get(part, [])
 
     @cached_property
     def _routes_by_target(self) -> dict[int, list[int]]:
@@ -215,12 +212,20 @@ def array_key(end: PartVariable) -> tuple[int, int, str]:
     return end.part, end.variable.value_reference, end.variable.kind
 
 
-def _filled(slots: _Slots, part: int, used: Iterable[tuple[int, Variable]]) -> list[Variable]:
+def _by_part(pairs: Iterable[tuple[int, Variable]]) -> defaultdict[int, list[Variable]]:
+    """The variables of each component."""
+    found = defaultdict(list)
+    for index, variable in pairs:
+        found[index].append(variable)
+    return found
+
+
+def _filled(slots: _Slots, part: int, used: Iterable[Variable]) -> list[Variable]:
     """Give a slot to each value of a component that is used, and return these.
 
     They are scalars as they are, and all elements of arrays of which something is there.
     """
-    wholes = (v if v.array is None else v.array for index, v in used if index == part)
+    wholes = (one if one.array is None else one.array for one in used)
     found = {_key(element): element for whole in wholes for element in whole.elements}
     for key in found:
         slots[part, *key] = len(slots)
