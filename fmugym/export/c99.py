@@ -160,13 +160,9 @@ class _Source:
     # The numbers of the graph.
 
     def _counted_uses(self) -> Counter[int]:
-        uses: Counter[int] = Counter()
-        for number in self._logic.needed - self._logic.loads.keys():
-            uses.update(self._graph.nodes[number].operands)
-        uses.update(self._logic.features)
-        uses.update(self._logic.input_nodes)
-        uses.update(node for kept in self._logic.kept for node in kept.updates)
-        return uses
+        roots, loads = self._logic.roots, self._logic.loads
+        computed = set(self._graph.needed(roots, loads)) - loads.keys()
+        return Counter([*roots, *(one for n in computed for one in self._graph.nodes[n].operands)])
 
     def _use(self, helper: str, letter: str) -> str:
         suffix = "" if letter == "d" else f"_{letter}"
@@ -280,14 +276,13 @@ class _Source:
 
     def _step(self) -> list[str]:
         logic, name = self._logic, self._name
-        updates = [node for kept in logic.kept for node in kept.updates]
         return [
             f"int {name}_step({name}_state *state, const double *measurements, double *actions) {{",
             "    const int64_t count = state->count;",
             "",
             *self._check_of_measurements(),
             *self._asking_the_network(),
-            *self._evaluated([*logic.input_nodes, *updates]),
+            *self._evaluated(logic.roots),
             *self._stored("actions", logic.input_nodes, "double"),
             *self._stored_state(),
             "    state->count = count + 1;",
