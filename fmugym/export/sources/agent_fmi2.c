@@ -2,9 +2,11 @@
 
 #include "fmi2Functions.h"
 
-#include "fmu_instance.h"
+#define FMI(name) fmi2##name
+#define OF_STATE(verb, noun) fmi2##verb##FMUstate##noun
+#define DESERIALIZE fmi2DeSerializeFMUstate
 
-#define OR_ERROR(done) ((done) ? fmi2OK : fmi2Error)
+#include "fmu_instance.h"
 
 static void emit(const void *instance, const char *message) {
     const Controller *controller = (const Controller *)instance;
@@ -37,10 +39,6 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, 
     return controller;
 }
 
-void fmi2FreeInstance(fmi2Component c) {
-    destroy((Controller *)c);
-}
-
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance,
                                fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
     Memory *memory = &((Controller *)c)->memory;
@@ -50,20 +48,6 @@ fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2R
 
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
     ((Controller *)c)->memory.mode = INITIALIZATION;
-    return fmi2OK;
-}
-
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
-    return OR_ERROR(end_initialization((Controller *)c));
-}
-
-fmi2Status fmi2Terminate(fmi2Component c) {
-    ((Controller *)c)->memory.mode = TERMINATED;
-    return fmi2OK;
-}
-
-fmi2Status fmi2Reset(fmi2Component c) {
-    begin((Controller *)c);
     return fmi2OK;
 }
 
@@ -94,49 +78,10 @@ ACCESS(Integer, 'i', value)
 ACCESS(Boolean, '?', value != 0.0)
 
 /* Functions of types that no variable has, and of derivatives. */
-#define OF_NONE(name, ...)                                                                         \
-    fmi2Status name(fmi2Component c, const fmi2ValueReference references[], size_t n,              \
-                    __VA_ARGS__) {                                                                 \
-        return OR_ERROR(n == 0);                                                                   \
-    }
-
-OF_NONE(fmi2GetString, fmi2String values[])
-OF_NONE(fmi2SetString, const fmi2String values[])
-OF_NONE(fmi2SetRealInputDerivatives, const fmi2Integer orders[], const fmi2Real values[])
-OF_NONE(fmi2GetRealOutputDerivatives, const fmi2Integer orders[], fmi2Real values[])
-
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    return OR_ERROR(remember((Controller *)c, state));
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-    return OR_ERROR(recall((Controller *)c, state));
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    free(*state);
-    *state = NULL;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
-    *size = sizeof(Memory);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[],
-                                 size_t size) {
-    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
-}
-
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
-                                   fmi2FMUstate *state) {
-    *state = NULL;
-    if (!remember((Controller *)c, state)) {
-        return fmi2Error;
-    }
-    return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));
-}
+OF_NONE(GetString, fmi2String values[])
+OF_NONE(SetString, const fmi2String values[])
+OF_NONE(SetRealInputDerivatives, const fmi2Integer orders[], const fmi2Real values[])
+OF_NONE(GetRealOutputDerivatives, const fmi2Integer orders[], fmi2Real values[])
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[],
                                         size_t n, const fmi2ValueReference knowns[], size_t m,

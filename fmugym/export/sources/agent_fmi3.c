@@ -2,9 +2,11 @@
 
 #include "fmi3Functions.h"
 
-#include "fmu_instance.h"
+#define FMI(name) fmi3##name
+#define OF_STATE(verb, noun) fmi3##verb##FMUState##noun
+#define DESERIALIZE fmi3DeserializeFMUState
 
-#define OR_ERROR(done) ((done) ? fmi3OK : fmi3Error)
+#include "fmu_instance.h"
 
 static void emit(const void *instance, const char *message) {
     const Controller *controller = (const Controller *)instance;
@@ -54,30 +56,12 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
     return NULL;
 }
 
-void fmi3FreeInstance(fmi3Instance c) {
-    destroy((Controller *)c);
-}
-
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance,
                                        fmi3Float64 tolerance, fmi3Float64 start,
                                        fmi3Boolean has_stop, fmi3Float64 stop) {
     Memory *memory = &((Controller *)c)->memory;
     memory->start = memory->time = start;
     memory->mode = INITIALIZATION;
-    return fmi3OK;
-}
-
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) {
-    return OR_ERROR(end_initialization((Controller *)c));
-}
-
-fmi3Status fmi3Terminate(fmi3Instance c) {
-    ((Controller *)c)->memory.mode = TERMINATED;
-    return fmi3OK;
-}
-
-fmi3Status fmi3Reset(fmi3Instance c) {
-    begin((Controller *)c);
     return fmi3OK;
 }
 
@@ -116,39 +100,6 @@ ACCESS(Int64, 'q')
 ACCESS(UInt64, 'Q')
 ACCESS(Boolean, '?')
 
-fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
-    return OR_ERROR(remember((Controller *)c, state));
-}
-
-fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
-    return OR_ERROR(recall((Controller *)c, state));
-}
-
-fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
-    free(*state);
-    *state = NULL;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) {
-    *size = sizeof(Memory);
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[],
-                                 size_t size) {
-    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
-}
-
-fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
-                                   fmi3FMUState *state) {
-    *state = NULL;
-    if (!remember((Controller *)c, state)) {
-        return fmi3Error;
-    }
-    return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));
-}
-
 fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 size, fmi3Boolean no_set_state,
                       fmi3Boolean *needs_events, fmi3Boolean *terminates, fmi3Boolean *is_early,
                       fmi3Float64 *last_time) {
@@ -164,19 +115,14 @@ fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 size, fmi3Bo
     fmi3Status name(__VA_ARGS__) {                                                                 \
         return fmi3Error;                                                                          \
     }
-#define OF_NONE(name, ...)                                                                         \
-    fmi3Status name(fmi3Instance c, const fmi3ValueReference references[], size_t n,               \
-                    __VA_ARGS__) {                                                                 \
-        return OR_ERROR(n == 0);                                                                   \
-    }
 
 LACKING(fmi3EnterEventMode, fmi3Instance c)
-OF_NONE(fmi3GetString, fmi3String values[], size_t nValues)
-OF_NONE(fmi3GetBinary, size_t valueSizes[], fmi3Binary values[], size_t nValues)
-OF_NONE(fmi3GetClock, fmi3Clock values[])
-OF_NONE(fmi3SetString, const fmi3String values[], size_t nValues)
-OF_NONE(fmi3SetBinary, const size_t valueSizes[], const fmi3Binary values[], size_t nValues)
-OF_NONE(fmi3SetClock, const fmi3Clock values[])
+OF_NONE(GetString, fmi3String values[], size_t nValues)
+OF_NONE(GetBinary, size_t valueSizes[], fmi3Binary values[], size_t nValues)
+OF_NONE(GetClock, fmi3Clock values[])
+OF_NONE(SetString, const fmi3String values[], size_t nValues)
+OF_NONE(SetBinary, const size_t valueSizes[], const fmi3Binary values[], size_t nValues)
+OF_NONE(SetClock, const fmi3Clock values[])
 LACKING(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference valueReference,
         size_t *nDependencies)
 LACKING(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
@@ -191,15 +137,15 @@ LACKING(fmi3GetAdjointDerivative, fmi3Instance c, const fmi3ValueReference unkno
         const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[], size_t nSensitivity)
 LACKING(fmi3EnterConfigurationMode, fmi3Instance c)
 LACKING(fmi3ExitConfigurationMode, fmi3Instance c)
-OF_NONE(fmi3GetIntervalDecimal, fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
-OF_NONE(fmi3GetIntervalFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[],
+OF_NONE(GetIntervalDecimal, fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
+OF_NONE(GetIntervalFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[],
         fmi3IntervalQualifier qualifiers[])
-OF_NONE(fmi3GetShiftDecimal, fmi3Float64 shifts[])
-OF_NONE(fmi3GetShiftFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[])
-OF_NONE(fmi3SetIntervalDecimal, const fmi3Float64 intervals[])
-OF_NONE(fmi3SetIntervalFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
-OF_NONE(fmi3SetShiftDecimal, const fmi3Float64 shifts[])
-OF_NONE(fmi3SetShiftFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+OF_NONE(GetShiftDecimal, fmi3Float64 shifts[])
+OF_NONE(GetShiftFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[])
+OF_NONE(SetIntervalDecimal, const fmi3Float64 intervals[])
+OF_NONE(SetIntervalFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+OF_NONE(SetShiftDecimal, const fmi3Float64 shifts[])
+OF_NONE(SetShiftFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
 LACKING(fmi3EvaluateDiscreteStates, fmi3Instance c)
 LACKING(fmi3UpdateDiscreteStates, fmi3Instance c, fmi3Boolean *discreteStatesNeedUpdate,
         fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,

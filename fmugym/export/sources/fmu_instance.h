@@ -205,4 +205,63 @@ static bool copy_bytes(const Controller *controller, void *to, const void *from,
     return true;
 }
 
+/* The functions that are the same in FMI 2.0 and 3.0. Whoever includes this tells how their names
+ * begin and are written. */
+
+#define OR_ERROR(done) ((done) ? FMI(OK) : FMI(Error))
+
+/* A function of values of a kind that no variable has. */
+#define OF_NONE(name, ...)                                                                         \
+    FMI(Status) FMI(name)(void *c, const FMI(ValueReference) references[], size_t n,               \
+                          __VA_ARGS__) {                                                           \
+        return OR_ERROR(n == 0);                                                                   \
+    }
+
+void FMI(FreeInstance)(void *c) {
+    destroy((Controller *)c);
+}
+
+FMI(Status) FMI(ExitInitializationMode)(void *c) {
+    return OR_ERROR(end_initialization((Controller *)c));
+}
+
+FMI(Status) FMI(Terminate)(void *c) {
+    ((Controller *)c)->memory.mode = TERMINATED;
+    return FMI(OK);
+}
+
+FMI(Status) FMI(Reset)(void *c) {
+    begin((Controller *)c);
+    return FMI(OK);
+}
+
+FMI(Status) OF_STATE(Get, )(void *c, void **state) {
+    return OR_ERROR(remember((Controller *)c, state));
+}
+
+FMI(Status) OF_STATE(Set, )(void *c, void *state) {
+    return OR_ERROR(recall((Controller *)c, state));
+}
+
+FMI(Status) OF_STATE(Free, )(void *c, void **state) {
+    free(*state);
+    *state = NULL;
+    return FMI(OK);
+}
+
+FMI(Status) OF_STATE(Serialized, Size)(void *c, void *state, size_t *size) {
+    *size = sizeof(Memory);
+    return FMI(OK);
+}
+
+FMI(Status) OF_STATE(Serialize, )(void *c, void *state, FMI(Byte) bytes[], size_t size) {
+    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
+}
+
+FMI(Status) DESERIALIZE(void *c, const FMI(Byte) bytes[], size_t size, void **state) {
+    *state = NULL;
+    const bool has_memory = remember((Controller *)c, state);
+    return OR_ERROR(has_memory && copy_bytes((Controller *)c, *state, bytes, size));
+}
+
 #endif
