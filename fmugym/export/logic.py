@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -257,7 +257,7 @@ class _Assembly:
         self._episode = env.inside.draws.draw(rng)
         self._starts = {**self._episode.variables, **decision.starts}
         self._drawn = set(env.inside.draws.drawn_names)
-        self._external = self._given(external)
+        self._external = found_in(env, external, self._graph, traced.observation)
         rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
         self._inputs = [
             (variable, node) for variable, node, is_chosen in rows if all_inputs or is_chosen
@@ -267,17 +267,6 @@ class _Assembly:
         self._kept: list[Kept] = []
         self._fields: dict[str, int] = {}
         self._parameters: list[Parameter] = []
-
-    def _given(self, names: Collection[str]) -> dict[int, Variable]:
-        """What the controller is given, by node; names differ from those of the plant's inputs."""
-        found = found_in(self._env, names, self._graph, self._traced.observation)
-        taken = {variable.name for variable in self._env.inside.interface.inputs}
-        return {
-            one.node: replace(one.variable, name=f"{one.variable.name}_given")
-            if one.variable.name in taken
-            else one.variable
-            for one in found
-        }
 
     def logic(self) -> Logic:
         """Find all that the features and the inputs depend on, from sample to sample."""
