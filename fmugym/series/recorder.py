@@ -52,33 +52,29 @@ class _Recorder:
         self._memory: Memory | None = None
         self._stores: list[Store] = []
         self.has_begun = False
-        self._steps: Any = None
 
     def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> None:
         """Write down that episodes have begun."""
         self._open(infos)
         self._add(self._rows.begin(mask, infos, observations))
 
-    def go_on(self, steps: Any) -> None:
-        """Begin in the middle of episodes that have had so many steps, shape (N,)."""
-        self.has_begun, self._steps = True, steps
-
-    def _open(self, infos: Infos) -> None:
-        if self._memory is not None:
+    def _open(self, infos: Infos, steps: Any = None) -> None:
+        """Find the columns; in the middle of episodes, these have had so many steps, shape (N,)."""
+        if self.has_begun:
             return
         self.has_begun = True
         self._rows = Rows(self.episodes, self._choice, self._indices, self._every, infos)
-        if self._steps is not None:
-            self._rows.go_on(self._steps)
+        if steps is not None:
+            self._rows.go_on(steps)
         if self._path is not None:
             self._stores.append(open_store(self._path, self._rows.columns))
             weakref.finalize(self, self._stores[0].close)
         self._memory = Memory(self._rows.columns, self._most_rows)
         self._stores.append(self._memory)
 
-    def add(self, outcome: Outcome, idle: MaskArray) -> None:
-        """Write down a step."""
-        self._open(outcome.infos)
+    def add(self, outcome: Outcome, idle: MaskArray, steps: Any) -> None:
+        """Write down a step, before which episodes had so many steps, shape (N,)."""
+        self._open(outcome.infos, steps)
         self._add(self._rows.add(outcome, idle))
 
     def present(self) -> FloatArray:
@@ -204,9 +200,8 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
         infos, seen = Infos(batched(info), 1), _batch(observation)
-        if not self._recorder.has_begun:
-            self._recorder.go_on(self._recorder.episodes.prototype.step_count - 1)
-        self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)
+        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen, no)
+        self._recorder.add(outcome, no, self._recorder.episodes.prototype.step_count - 1)
         return observation, reward, terminated, truncated, info
 
     def complete(self) -> None:
@@ -273,6 +268,7 @@ class RecordVectorSeries(VectorWrapper):
         self._ended = np.zeros(env.num_envs, np.bool_)
         self._recorder = _Recorder(self._envs, variables, environments, every, path, most_rows)
         self._at_end: FloatArray | None = None
+        self._steps: Any = None
         if self._mode is AutoresetMode.SAME_STEP:
             env.inside.look_at_ends(self._look)
 
@@ -311,11 +307,11 @@ class RecordVectorSeries(VectorWrapper):
         return self._noted(actions, self.env.step(actions))
 
     def _go_on(self) -> None:
-        """Begin in the middle of episodes, if there was no reset."""
+        """Count the steps of episodes in the middle of which the recording begins."""
         envs: Any = self.env
         if not self._recorder.has_begun and envs.inside.episodes.started:
-            counts = self._envs.evaluate(lambda env: (env.step_count,), np.arange(self.num_envs))
-            self._recorder.go_on(counts[0])
+            everywhere = np.arange(self.num_envs)
+            (self._steps,) = self._envs.evaluate(lambda env: (env.step_count,), everywhere)
 
     def step_async(self, actions: Any) -> None:
         """Begin a step; see ``FMUVectorEnv.step_async``."""
@@ -338,7 +334,8 @@ class RecordVectorSeries(VectorWrapper):
         if same_step:
             last, seen = self._last(infos, observations, ended)
         at_end = self._at_end if same_step else None
-        self._recorder.add(Outcome(rewards, terminated, truncated, last, seen, ended, at_end), idle)
+        outcome = Outcome(rewards, terminated, truncated, last, seen, ended, at_end)
+        self._recorder.add(outcome, idle, self._steps)
         begun = ended if same_step else idle
         self._ended = none if same_step else ended
         if begun.any():

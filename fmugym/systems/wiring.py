@@ -167,7 +167,7 @@ class Wiring:
         first = self._first(ends)
         end = _end(connection, target, self._own_unit(name, first or target), self._unit(target))
         if first is None:
-            _check_gain(connection, target, target)
+            _check_gain(connection, target)
         else:
             _check_kinds(connection, first, target)
         ends.append(end)
@@ -195,7 +195,7 @@ class Wiring:
         self._claim(name, "output", connection)
         _require_number(connection, source)
         end = _end(connection, source, self._unit(source), self._own_unit(name, source))
-        _check_gain(connection, source, source)
+        _check_gain(connection, source)
         self._ends[name] = [end]
 
     def _claim(self, name: str, causality: str, connection: Connection) -> None:
@@ -275,10 +275,10 @@ def _check_kinds(connection: Connection, source: Port, target: Port) -> None:
             f"{connection}: {source.name} is of type {source.variable.type} and {target.name} of "
             f"type {target.variable.type}; only equal kinds can be connected, and Integer with Real"
         )
-    _check_gain(connection, source, target)
+    _check_gain(connection, target)
 
 
-def _check_gain(connection: Connection, source: Port, target: Port) -> None:
+def _check_gain(connection: Connection, target: Port) -> None:
     plain = connection.gain == 1 and connection.offset == 0
     if target.kind != "real" and not plain:
         raise ConfigError(
