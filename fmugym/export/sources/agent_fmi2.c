@@ -5,6 +5,8 @@
 #define FMI(name) fmi2##name
 #define OF_STATE(verb, noun) fmi2##verb##FMUstate##noun
 #define DESERIALIZE fmi2DeSerializeFMUstate
+#define AND_LENGTH
+#define FITS true
 
 #include "fmu_instance.h"
 
@@ -51,31 +53,9 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
     return fmi2OK;
 }
 
-#define ACCESS(Type, kind, converted)                                                              \
-    fmi2Status fmi2Get##Type(fmi2Component c, const fmi2ValueReference references[], size_t n,     \
-                             fmi2##Type values[]) {                                                \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            double value = 0.0;                                                                    \
-            if (!get_value((Controller *)c, references[i], kind, &value)) {                        \
-                return fmi2Error;                                                                  \
-            }                                                                                      \
-            values[i] = (fmi2##Type)(converted);                                                   \
-        }                                                                                          \
-        return fmi2OK;                                                                             \
-    }                                                                                              \
-    fmi2Status fmi2Set##Type(fmi2Component c, const fmi2ValueReference references[], size_t n,     \
-                             const fmi2##Type values[]) {                                          \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            if (!set_value((Controller *)c, references[i], kind, (double)values[i])) {             \
-                return fmi2Error;                                                                  \
-            }                                                                                      \
-        }                                                                                          \
-        return fmi2OK;                                                                             \
-    }
-
-ACCESS(Real, 'd', value)
-ACCESS(Integer, 'i', value)
-ACCESS(Boolean, '?', value != 0.0)
+ACCESS(Real, 'd')
+ACCESS(Integer, 'i')
+ACCESS(Boolean, '?')
 
 /* Functions of types that no variable has, and of derivatives. */
 OF_NONE(GetString, fmi2String values[])

@@ -5,6 +5,8 @@
 #define FMI(name) fmi3##name
 #define OF_STATE(verb, noun) fmi3##verb##FMUState##noun
 #define DESERIALIZE fmi3DeserializeFMUState
+#define AND_LENGTH , size_t length
+#define FITS (n == length)
 
 #include "fmu_instance.h"
 
@@ -64,29 +66,6 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance
     memory->mode = INITIALIZATION;
     return fmi3OK;
 }
-
-#define ACCESS(Type, kind)                                                                         \
-    fmi3Status fmi3Get##Type(fmi3Instance c, const fmi3ValueReference references[], size_t n,      \
-                             fmi3##Type values[], size_t n_values) {                               \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            double value = 0.0;                                                                    \
-            if (n != n_values || !get_value((Controller *)c, references[i], kind, &value)) {       \
-                return fmi3Error;                                                                  \
-            }                                                                                      \
-            values[i] = (fmi3##Type)value;                                                         \
-        }                                                                                          \
-        return fmi3OK;                                                                             \
-    }                                                                                              \
-    fmi3Status fmi3Set##Type(fmi3Instance c, const fmi3ValueReference references[], size_t n,      \
-                             const fmi3##Type values[], size_t n_values) {                         \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            if (n != n_values ||                                                                   \
-                !set_value((Controller *)c, references[i], kind, (double)values[i])) {             \
-                return fmi3Error;                                                                  \
-            }                                                                                      \
-        }                                                                                          \
-        return fmi3OK;                                                                             \
-    }
 
 ACCESS(Float32, 'f')
 ACCESS(Float64, 'd')

@@ -206,9 +206,32 @@ static bool copy_bytes(const Controller *controller, void *to, const void *from,
 }
 
 /* The functions that are the same in FMI 2.0 and 3.0. Whoever includes this tells how their names
- * begin and are written. */
+ * begin and are written, and whether arrays of values tell their length. */
 
 #define OR_ERROR(done) ((done) ? FMI(OK) : FMI(Error))
+
+/* The functions that get and set the variables of a type. */
+#define ACCESS(Type, kind)                                                                         \
+    FMI(Status) FMI(Get##Type)(void *c, const FMI(ValueReference) references[], size_t n,          \
+                               FMI(Type) values[] AND_LENGTH) {                                    \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            double value = 0.0;                                                                    \
+            if (!FITS || !get_value((Controller *)c, references[i], kind, &value)) {               \
+                return FMI(Error);                                                                 \
+            }                                                                                      \
+            values[i] = (FMI(Type))(kind == '?' ? value != 0.0 : value);                           \
+        }                                                                                          \
+        return FMI(OK);                                                                            \
+    }                                                                                              \
+    FMI(Status) FMI(Set##Type)(void *c, const FMI(ValueReference) references[], size_t n,          \
+                               const FMI(Type) values[] AND_LENGTH) {                              \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            if (!FITS || !set_value((Controller *)c, references[i], kind, (double)values[i])) {    \
+                return FMI(Error);                                                                 \
+            }                                                                                      \
+        }                                                                                          \
+        return FMI(OK);                                                                            \
+    }
 
 /* A function of values of a kind that no variable has. */
 #define OF_NONE(name, ...)                                                                         \
