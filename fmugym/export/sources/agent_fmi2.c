@@ -11,7 +11,7 @@
 #include "fmu_instance.h"
 
 static void emit(const void *instance, const char *message) {
-    const Controller *controller = (const Controller *)instance;
+    const Controller *controller = instance;
     fmi2CallbackLogger logger;
     memcpy(&logger, &controller->logger, sizeof logger); /* ISO C has no cast between the two */
     logger(controller->environment, controller->name, fmi2Error, "logStatusError", message);
@@ -70,7 +70,7 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_set_state) {
-    return OR_ERROR(step((Controller *)c, time, size));
+    return OR_ERROR(step(c, time, size));
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c) {

@@ -11,7 +11,7 @@
 #include "fmu_instance.h"
 
 static void emit(const void *instance, const char *message) {
-    const Controller *controller = (const Controller *)instance;
+    const Controller *controller = instance;
     fmi3LogMessageCallback log_message;
     memcpy(&log_message, &controller->logger, sizeof log_message); /* C has no cast between them */
     log_message(controller->environment, fmi3Error, "logStatusError", message);
@@ -82,7 +82,7 @@ ACCESS(Boolean, '?')
 fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 size, fmi3Boolean no_set_state,
                       fmi3Boolean *needs_events, fmi3Boolean *terminates, fmi3Boolean *is_early,
                       fmi3Float64 *last_time) {
-    const bool done = step((Controller *)c, time, size);
+    const bool done = step(c, time, size);
     *needs_events = *terminates = *is_early = false;
     *last_time = ((Controller *)c)->memory.time;
     return OR_ERROR(done);

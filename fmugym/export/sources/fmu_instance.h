@@ -58,12 +58,12 @@ static Controller *create(const char *name, const char *token) {
     if (token == NULL || strcmp(token, TOKEN) != 0) {
         return NULL;
     }
-    Controller *controller = (Controller *)calloc(1, sizeof *controller);
+    Controller *controller = calloc(1, sizeof *controller);
     if (controller == NULL) {
         return NULL;
     }
     name = name == NULL ? "" : name;
-    controller->name = (char *)malloc(strlen(name) + 1);
+    controller->name = malloc(strlen(name) + 1);
     if (controller->name == NULL) {
         free(controller);
         return NULL;
@@ -216,7 +216,7 @@ static bool copy_bytes(const Controller *controller, void *to, const void *from,
                                FMI(Type) values[] AND_LENGTH) {                                    \
         for (size_t i = 0; i < n; i++) {                                                           \
             double value = 0.0;                                                                    \
-            if (!FITS || !get_value((Controller *)c, references[i], kind, &value)) {               \
+            if (!FITS || !get_value(c, references[i], kind, &value)) {                             \
                 return FMI(Error);                                                                 \
             }                                                                                      \
             values[i] = (FMI(Type))(kind == '?' ? value != 0.0 : value);                           \
@@ -226,7 +226,7 @@ static bool copy_bytes(const Controller *controller, void *to, const void *from,
     FMI(Status) FMI(Set##Type)(void *c, const FMI(ValueReference) references[], size_t n,          \
                                const FMI(Type) values[] AND_LENGTH) {                              \
         for (size_t i = 0; i < n; i++) {                                                           \
-            if (!FITS || !set_value((Controller *)c, references[i], kind, (double)values[i])) {    \
+            if (!FITS || !set_value(c, references[i], kind, (double)values[i])) {                  \
                 return FMI(Error);                                                                 \
             }                                                                                      \
         }                                                                                          \
@@ -241,11 +241,11 @@ static bool copy_bytes(const Controller *controller, void *to, const void *from,
     }
 
 void FMI(FreeInstance)(void *c) {
-    destroy((Controller *)c);
+    destroy(c);
 }
 
 FMI(Status) FMI(ExitInitializationMode)(void *c) {
-    return OR_ERROR(end_initialization((Controller *)c));
+    return OR_ERROR(end_initialization(c));
 }
 
 FMI(Status) FMI(Terminate)(void *c) {
@@ -254,16 +254,16 @@ FMI(Status) FMI(Terminate)(void *c) {
 }
 
 FMI(Status) FMI(Reset)(void *c) {
-    begin((Controller *)c);
+    begin(c);
     return FMI(OK);
 }
 
 FMI(Status) OF_STATE(Get, )(void *c, void **state) {
-    return OR_ERROR(remember((Controller *)c, state));
+    return OR_ERROR(remember(c, state));
 }
 
 FMI(Status) OF_STATE(Set, )(void *c, void *state) {
-    return OR_ERROR(recall((Controller *)c, state));
+    return OR_ERROR(recall(c, state));
 }
 
 FMI(Status) OF_STATE(Free, )(void *c, void **state) {
@@ -278,13 +278,13 @@ FMI(Status) OF_STATE(Serialized, Size)(void *c, void *state, size_t *size) {
 }
 
 FMI(Status) OF_STATE(Serialize, )(void *c, void *state, FMI(Byte) bytes[], size_t size) {
-    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
+    return OR_ERROR(copy_bytes(c, bytes, state, size));
 }
 
 FMI(Status) DESERIALIZE(void *c, const FMI(Byte) bytes[], size_t size, void **state) {
     *state = NULL;
-    const bool has_memory = remember((Controller *)c, state);
-    return OR_ERROR(has_memory && copy_bytes((Controller *)c, *state, bytes, size));
+    const bool has_memory = remember(c, state);
+    return OR_ERROR(has_memory && copy_bytes(c, *state, bytes, size));
 }
 
 #endif
