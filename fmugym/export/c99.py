@@ -13,7 +13,6 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError
 from fmugym.export.exportable import Agent
 from fmugym.export.layers import array, bare, c_type, network_lines
 from fmugym.export.names import identifiers, new_file
@@ -204,9 +203,7 @@ class _Source:
                 table, place = self._table(node.what), operands[0]
                 count = len(self._graph.tables[node.what])
                 return f"{table}[{place} < 0 ? {place} + {count} : {place}]"
-            case "interpolate":
-                return self._interpolation(node, operands[0])
-        raise ConfigError(f"an operation of kind {node.kind!r} cannot be exported to C")
+        return self._interpolation(node, operands[0])
 
     def _loaded(self, number: int, node: Node) -> str:
         load = self._logic.loads[number]

@@ -60,7 +60,7 @@ class Kept:
     name: str
     dtype: np.dtype[Any]
     starts: tuple[Any, ...]
-    updates: tuple[int, ...] = ()
+    updates: tuple[int, ...]
 
 
 @dataclass(frozen=True)

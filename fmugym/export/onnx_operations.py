@@ -124,9 +124,7 @@ class Operations:
                 return nodes.add("Where", *operands)
             case "take":
                 return nodes.add("Gather", nodes.tensor(self._graph.tables[what]), *operands)
-            case "interpolate":
-                return self._interpolated(node.operands[0], self._graph.tables[what])
-        raise ConfigError(f"an operation of kind {node.kind!r} cannot be exported to ONNX")
+        return self._interpolated(node.operands[0], self._graph.tables[what])
 
     def _function(self, ufunc: Any, numbers: Iterable[int]) -> str:
         add, operands = self._nodes.add, [self._names[number] for number in numbers]

@@ -97,8 +97,8 @@ class Cell:
         self,
         experiment: str,
         position: Sequence[float],
-        disturbances: Sequence[Disturbance] = (),
-        recording: Recording | None = None,
+        disturbances: Sequence[Disturbance],
+        recording: Recording | None,
     ) -> None:
         """Bring the arm to its start position and release it.
 

@@ -46,11 +46,11 @@ class Request:
 
     experiment_type: str
     length: float
-    preparation_time: float = 0.0
-    position: Any = None
-    record: bool = False
-    cell_id: int | None = None
-    disturbances: str | Disturbance | Sequence[Disturbance] | None = None
+    preparation_time: float
+    position: Any
+    record: bool
+    cell_id: int | None
+    disturbances: str | Disturbance | Sequence[Disturbance] | None
 
     def __post_init__(self) -> None:
         with as_lab_error():

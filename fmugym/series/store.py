@@ -6,7 +6,7 @@ import csv
 import json
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -55,8 +55,8 @@ class Block:
     """
 
     values: FloatArray
-    faults: Mapping[int, str] = field(default_factory=dict)
-    texts: Mapping[float, str] = field(default_factory=dict)
+    faults: Mapping[int, str]
+    texts: Mapping[float, str]
 
     def __len__(self) -> int:
         return len(self.values)

@@ -101,8 +101,8 @@ class Layout:
     def __init__(
         self,
         description: SystemDescription,
-        inputs: Iterable[Variable] = (),
-        outputs: Iterable[Variable] = (),
+        inputs: Iterable[Variable],
+        outputs: Iterable[Variable],
     ) -> None:
         self.description, self.plan = description, description.plan
         pairs = zip(self.plan.components, description.parts, strict=True)

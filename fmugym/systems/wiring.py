@@ -74,8 +74,8 @@ class Wiring:
     components: Mapping[str, OpenComponent]
     connections: Iterable[Connection]
     units: Mapping[str, str]
-    own_names: frozenset[str] = frozenset()
-    definitions: Mapping[str, Unit] = field(default_factory=dict)
+    own_names: frozenset[str]
+    definitions: Mapping[str, Unit]
     links: list[Link] = field(default_factory=list)
     connectors: list[Connector] = field(default_factory=list)
     _driven: dict[str, Connection] = field(default_factory=dict)
