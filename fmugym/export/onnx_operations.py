@@ -20,14 +20,17 @@ from fmugym.vector.hooks.symbols import Symbols
 __all__ = ["Operations"]
 
 _SAME: Final[Mapping[str, str]] = {
-    "add": "Add",
+    **{
+        name: name.capitalize()
+        for name in (
+            *("add", "less", "equal", "greater", "and", "or", "xor", "not"),
+            *("sqrt", "exp", "log", "sin", "cos", "tanh", "floor", "ceil"),
+        )
+    },
     "subtract": "Sub",
     "multiply": "Mul",
     "divide": "Div",
-    "less": "Less",
     "less_equal": "LessOrEqual",
-    "equal": "Equal",
-    "greater": "Greater",
     "greater_equal": "GreaterOrEqual",
     "minimum": "Min",
     "maximum": "Max",
@@ -35,9 +38,6 @@ _SAME: Final[Mapping[str, str]] = {
     "absolute": "Abs",
     "negative": "Neg",
     "rint": "Round",
-    **{name: name.capitalize() for name in ("and", "or", "xor", "not")},
-    **{name: name.capitalize() for name in ("sqrt", "exp", "log", "sin", "cos", "tanh")},
-    **{name: name.capitalize() for name in ("floor", "ceil")},
 }
 """Operations that ONNX has, for the same types of operands."""
 
