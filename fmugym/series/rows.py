@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -35,7 +36,7 @@ class Infos(NamedTuple):
 
     of_envs: Mapping[str, Any]
     num_envs: int
-    last: Mapping[str, Any] | None = None
+    last: Mapping[str, Any] = MappingProxyType({})
     ended: Any = False
 
     def names(self, group: str) -> list[str]:
@@ -44,16 +45,13 @@ class Infos(NamedTuple):
 
     def numbers(self, *path: str) -> FloatArray:
         """The numbers at a place in the infos, shape (N,); 0 where there are none."""
-        numbers = _numbers(self.of_envs, path, self.num_envs)
-        if self.last is None:
-            return numbers
-        return np.where(self.ended, _numbers(self.last, path, self.num_envs), numbers)
+        now, last = (_numbers(infos, path, self.num_envs) for infos in (self.of_envs, self.last))
+        return np.where(self.ended, last, now)
 
     def each(self, name: str) -> dict[int, Any]:
         """The values of those environments that have one."""
-        if self.last is None:
-            return _each(self.of_envs, name)
-        now = {i: one for i, one in _each(self.of_envs, name).items() if not self.ended[i]}
+        ended = np.flatnonzero(self.ended)
+        now = {i: one for i, one in _each(self.of_envs, name).items() if i not in ended}
         return now | _each(self.last, name)
 
 
