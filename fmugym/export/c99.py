@@ -13,7 +13,6 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError
 from fmugym.export.exportable import Agent
 from fmugym.export.layers import array, bare, c_type, network_lines
 from fmugym.export.names import identifiers, new_file
@@ -160,13 +159,9 @@ class _Source:
     # The numbers of the graph.
 
     def _counted_uses(self) -> Counter[int]:
-        uses: Counter[int] = Counter()
-        for number in self._logic.needed - self._logic.loads.keys():
-            uses.update(self._graph.nodes[number].operands)
-        uses.update(self._logic.features)
-        uses.update(self._logic.input_nodes)
-        uses.update(node for kept in self._logic.kept for node in kept.updates)
-        return uses
+        roots, loads = self._logic.roots, self._logic.loads
+        computed = set(self._graph.needed(roots, loads)) - loads.keys()
+        return Counter([*roots, *(one for n in computed for one in self._graph.nodes[n].operands)])
 
     def _use(self, helper: str, letter: str) -> str:
         suffix = "" if letter == "d" else f"_{letter}"
@@ -196,10 +191,10 @@ class _Source:
         if number in self._logic.loads:
             return self._loaded(number, node)
         operands = [self._texts[operand] for operand in node.operands]
-        letters = "".join(self._graph.nodes[operand].dtype.char for operand in node.operands)
         match node.kind:
             case "ufunc":
-                return expression(node.what, operands, letters, self._use)
+                dtype = self._graph.nodes[node.operands[0]].dtype
+                return expression(node.what, operands, dtype, self._use)
             case "cast":
                 return self._cast(node, operands[0])
             case "where":
@@ -208,9 +203,7 @@ class _Source:
                 table, place = self._table(node.what), operands[0]
                 count = len(self._graph.tables[node.what])
                 return f"{table}[{place} < 0 ? {place} + {count} : {place}]"
-            case "interpolate":
-                return self._interpolation(node, operands[0])
-        raise ConfigError(f"an operation of kind {node.kind!r} cannot be exported to C")
+        return self._interpolation(node, operands[0])
 
     def _loaded(self, number: int, node: Node) -> str:
         load = self._logic.loads[number]
@@ -267,8 +260,7 @@ class _Source:
 
     def _helper_lines(self) -> Iterator[str]:
         for (helper, letter), name in self._helpers.items():
-            suffix = "f" if letter == "f" else ""
-            yield "static " + HELPERS[helper].format(T=TYPES[letter], name=name, f=suffix)
+            yield "static " + HELPERS[helper].format(T=TYPES[letter], name=name)
             yield ""
 
     def _init(self) -> Iterator[str]:
@@ -281,14 +273,13 @@ class _Source:
 
     def _step(self) -> list[str]:
         logic, name = self._logic, self._name
-        updates = [node for kept in logic.kept for node in kept.updates]
         return [
             f"int {name}_step({name}_state *state, const double *measurements, double *actions) {{",
             "    const int64_t count = state->count;",
             "",
             *self._check_of_measurements(),
             *self._asking_the_network(),
-            *self._evaluated([*logic.input_nodes, *updates]),
+            *self._evaluated(logic.roots),
             *self._stored("actions", logic.input_nodes, "double"),
             *self._stored_state(),
             "    state->count = count + 1;",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Final
 
@@ -43,8 +43,8 @@ class Agent:
     name: str
     logic: Logic
     network: Network | None
-    notes: tuple[str, ...] = ()
-    units: Mapping[str, Unit] = field(default_factory=dict)
+    notes: tuple[str, ...]
+    units: Mapping[str, Unit]
 
     @property
     def version(self) -> str:

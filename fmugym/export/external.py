@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,26 +15,13 @@ from fmugym.errors import ConfigError, unknown_name
 from fmugym.export.names import identifier
 from fmugym.vector.hooks.graph import Graph
 
-__all__ = ["External", "found_in"]
-
-
-@dataclass(frozen=True)
-class External:
-    """A value of data, now or at another time, that the agent observes.
-
-    Attributes:
-        node: Where the program would look it up.
-        variable: What takes its place.
-    """
-
-    node: int
-    variable: Variable
+__all__ = ["found_in"]
 
 
 def found_in(
     env: FMUEnv, names: Collection[str], graph: Graph, observation: Sequence[int]
-) -> list[External]:
-    """Find the values of data in an observation.
+) -> dict[int, Variable]:
+    """Find the values of data in an observation, now or at other times.
 
     Args:
         env: The environment of a task file.
@@ -43,16 +29,20 @@ def found_in(
         graph: The operations.
         observation: The nodes of the elements of the observation.
 
+    Returns:
+        What takes the place of each, by the node that would look it up. Names differ from those of
+        the plant's inputs.
+
     Raises:
         ConfigError: If there are no such data, or the agent does not observe them.
     """
     if not names:
-        return []
+        return {}
     seen = env.observation_names if isinstance(env, TaskEnv) else None
     if not isinstance(env, TaskEnv) or seen is None:
         raise ConfigError("only what a task file observes can be given to the agent from outside")
     series = Declarations(env.task.root, env.fmu.description).series
-    found = []
+    found = {}
     for name in names:
         if name not in series:
             raise ConfigError(unknown_name("data", name, list(series)))
@@ -61,7 +51,7 @@ def found_in(
             raise ConfigError(f"the agent does not observe {name!r}, so that nobody need give it")
         for place in places:
             node = _lookup_in(graph, observation[place], series[name])
-            found.append(External(node, _variable(seen[place], series[name], env)))
+            found[node] = _variable(seen[place], series[name], env)
     return found
 
 
@@ -84,5 +74,6 @@ def _variable(name: str, series: Any, env: FMUEnv) -> Variable:
         "unit": series.unit,
         "description": f"{name} of the task",
     }
+    own, taken = identifier(name), env.inside.interface.input_names
     kind = "Float64" if env.fmu.description.fmi_version.startswith("3") else "Real"
-    return Variable(identifier(name), kind, **facts)
+    return Variable(f"{own}_given" if own in taken else own, kind, **facts)

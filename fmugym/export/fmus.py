@@ -7,7 +7,7 @@ import shutil
 import tempfile
 import uuid
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -85,7 +85,7 @@ def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
         texts[name] = (own / name).read_text(encoding="ascii")
     told = "\0".join([*texts.values(), *map(repr, ports)])
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, told)}}}"
-    texts["fmu_model.h"] = "\n".join(_model(agent, ports, token))
+    texts["fmu_model.h"] = _model(agent, ports, token)
     if fmi_version == "3.0":
         texts["buildDescription.xml"] = _build_description(agent)
     for name, text in texts.items():
@@ -95,55 +95,53 @@ def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
     return token
 
 
-def _model(agent: Agent, ports: Sequence[Port], token: str) -> Iterator[str]:
+def _model(agent: Agent, ports: Sequence[Port], token: str) -> str:
     """What the functions of FMI need to know of the agent."""
-    name, upper, logic = agent.name, agent.name.upper(), agent.logic
+    name, logic = agent.name, agent.logic
     starts = [constant(one.start, "d") for one in ports if one.causality == "input"]
     fixed = [
         "true" if one.variability == "fixed" else "false"
         for one in ports
         if one.causality == "parameter"
     ]
-    yield "/* The agent, for the functions of FMI. */"
-    yield ""
-    yield f'#include "{name}.h"'
-    yield ""
-    yield f'#define TOKEN "{token}"'
-    yield f"#define AGENT_STATE {name}_state"
-    yield f"#define AGENT_INIT {name}_init"
-    yield f"#define AGENT_STEP {name}_step"
-    yield f"#define SAMPLE_TIME {upper}_SAMPLE_TIME"
-    yield f"#define MEASUREMENTS {len(logic.measurements)}u"
-    yield f"#define ACTIONS {len(logic.inputs)}u"
-    yield ""
-    yield "/* The types of the variables, the time first. */"
-    yield f'static const char kinds[] = "d{"".join(map(kind_of, ports))}";'.replace("??", '?""?')
-    yield f"static const double first_measurements[] = {{{', '.join([*starts, '0.0'])}}};"
-    yield f"static const bool is_fixed[] = {{{', '.join([*fixed, 'false'])}}};"
-    yield ""
-    yield from _parameters(agent)
+    kinds = "".join(map(kind_of, ports)).replace("??", '?""?')
+    return f"""/* The agent, for the functions of FMI. */
+
+#include "{name}.h"
+
+#define TOKEN "{token}"
+#define AGENT_STATE {name}_state
+#define AGENT_INIT {name}_init
+#define AGENT_STEP {name}_step
+#define SAMPLE_TIME {name.upper()}_SAMPLE_TIME
+#define MEASUREMENTS {len(logic.measurements)}u
+#define ACTIONS {len(logic.inputs)}u
+
+/* The types of the variables, the time first. */
+static const char kinds[] = "d{kinds}";
+static const double first_measurements[] = {{{", ".join([*starts, "0.0"])}}};
+static const bool is_fixed[] = {{{", ".join([*fixed, "false"])}}};
+
+{_parameters(agent)}"""
 
 
-def _parameters(agent: Agent) -> Iterator[str]:
-    fields = field_names(agent)
-    places = [(f"{fields[one.field]}[{one.element}]", one.field) for one in agent.logic.parameters]
-    yield "static double get_parameter(const AGENT_STATE *agent, unsigned place) {"
-    for number, (text, _) in enumerate(places):
-        yield f"    if (place == {number}) {{"
-        yield f"        return (double)agent->{text};"
-        yield "    }"
-    yield "    (void)agent, (void)place;"
-    yield "    return 0.0;"
-    yield "}"
-    yield ""
-    yield "static void set_parameter(AGENT_STATE *agent, unsigned place, double value) {"
-    for number, (text, field) in enumerate(places):
-        yield f"    if (place == {number}) {{"
-        yield f"        agent->{text} = ({c_type(agent.logic.kept[field].dtype)})value;"
-        yield "    }"
-    yield "    (void)agent, (void)place, (void)value;"
-    yield "}"
-    yield ""
+def _parameters(agent: Agent) -> str:
+    fields, logic = field_names(agent), agent.logic
+    gets = sets = ""
+    for number, one in enumerate(logic.parameters):
+        place, kind = f"{fields[one.field]}[{one.element}]", c_type(logic.kept[one.field].dtype)
+        condition = f"    if (place == {number}) {{\n        "
+        gets += f"{condition}return (double)agent->{place};\n    }}\n"
+        sets += f"{condition}agent->{place} = ({kind})value;\n    }}\n"
+    return f"""static double get_parameter(const AGENT_STATE *agent, unsigned place) {{
+{gets}    (void)agent, (void)place;
+    return 0.0;
+}}
+
+static void set_parameter(AGENT_STATE *agent, unsigned place, double value) {{
+{sets}    (void)agent, (void)place, (void)value;
+}}
+"""
 
 
 def _build_description(agent: Agent) -> str:

@@ -47,30 +47,25 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
         yield other
 
 
-def ideal(
-    document: Mapping[str, Any], of_actuators: Iterable[str] = _OF_ACTUATORS
-) -> dict[str, Any]:
+def ideal(document: Mapping[str, Any], of_actuators: Iterable[str] = _OF_ACTUATORS) -> Any:
     """Return a task's document without its sensors, errors of forecasts and warm-up.
 
     Args:
         document: The document.
         of_actuators: The keys of actuators that are left out, too.
     """
-    ideal = dict(document)
-    ideal.pop("warm_up", None)
+    ideal = _without(document, ("warm_up",))
     agent = document.get("agent", {})
     actions = agent.get("actions", ())
     actions = [actions] if isinstance(actions, str) else actions
-    variables = document.get("variables", {})
-    ideal["variables"] = {
-        name: _without(one, of_actuators if name in actions else DEVICE)
-        for name, one in variables.items()
-    }
+    if "variables" in document:
+        ideal["variables"] = {
+            name: _without(one, of_actuators if name in actions else DEVICE)
+            for name, one in document["variables"].items()
+        }
     if "forecast" in agent:
         ideal["agent"] = {**agent, "forecast": _exact(agent["forecast"])}
-    return (
-        ideal if "variables" in document else {k: v for k, v in ideal.items() if k != "variables"}
-    )
+    return ideal
 
 
 def _exact(forecast: Any) -> Any:

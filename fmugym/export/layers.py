@@ -73,30 +73,31 @@ def network_lines(name: str, network: Network) -> Iterator[str]:
         name: The name of the agent.
         network: The network.
     """
-    letter = network.dtype.char
-    kind = TYPES[letter]
     for index, layer in enumerate(network.layers):
         yield from array(f"{name}_weights_{index}", layer.weights.T)
         yield from array(f"{name}_bias_{index}", layer.bias)
         yield ""
-    yield "/* The sum of each column of weights times an input, and a bias. */"
-    yield f"static void {name}_layer(const {kind} *weights, const {kind} *bias, const {kind} *from,"
-    yield f"    int inputs, {kind} *to, int outputs) {{"
-    yield "    for (int i = 0; i < outputs; i++) {"
-    yield "        to[i] = bias[i];"
-    yield "    }"
-    yield "    for (int j = 0; j < inputs; j++) {"
-    yield f"        const {kind} *column = weights + j * outputs;"
-    yield "        for (int i = 0; i < outputs; i++) {"
-    yield "            to[i] += column[i] * from[j];"
-    yield "        }"
-    yield "    }"
+    yield _FUNCTIONS.format(name=name, kind=c_type(network.dtype))
+    yield from _network_body(name, network, network.dtype.char)
     yield "}"
     yield ""
-    yield f"static void {name}_network(const {kind} *features, {kind} *given) {{"
-    yield from _network_body(name, network, letter)
-    yield "}"
-    yield ""
+
+
+_FUNCTIONS: Final = """/* The sum of each column of weights times an input, and a bias. */
+static void {name}_layer(const {kind} *weights, const {kind} *bias, const {kind} *from,
+    int inputs, {kind} *to, int outputs) {{
+    for (int i = 0; i < outputs; i++) {{
+        to[i] = bias[i];
+    }}
+    for (int j = 0; j < inputs; j++) {{
+        const {kind} *column = weights + j * outputs;
+        for (int i = 0; i < outputs; i++) {{
+            to[i] += column[i] * from[j];
+        }}
+    }}
+}}
+
+static void {name}_network(const {kind} *features, {kind} *given) {{"""
 
 
 def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:

@@ -9,8 +9,9 @@ what the agent remembers.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from fmugym.export.external import found_in
 from fmugym.export.imperfections import without_imperfections
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.graph import Graph, Node
+from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbolic import element_names
@@ -41,7 +42,6 @@ Load = tuple[Any, ...]
 
 _GIVEN: Final = "given"
 _ANY_ACTION: Final = "any action"
-_PAST_ACTIONS: Final = ("action", "previous_action")
 _SEED: Final = 0
 _OF_ANY: Final = Decision()
 
@@ -60,7 +60,7 @@ class Kept:
     name: str
     dtype: np.dtype[Any]
     starts: tuple[Any, ...]
-    updates: tuple[int, ...] = ()
+    updates: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,10 @@ class Logic:
     time_step: float
 
     @property
-    def needed(self) -> set[int]:
-        """The nodes that one sample computes."""
+    def roots(self) -> list[int]:
+        """The nodes that one sample is for."""
         updates = (node for kept in self.kept for node in kept.updates)
-        roots = [*self.features, *self.input_nodes, *updates]
-        return set(self.graph.needed(roots, self.loads))
+        return [*self.features, *self.input_nodes, *updates]
 
 
 def logic_of(
@@ -237,10 +236,8 @@ class _ControllerTracer(Tracer):
             env.action = one
             self._contents = Contents(env)
             found.append(self._call("_get_inputs", self._input_nodes))
-        are_chosen = (
-            any(_is_row(self._graph.nodes[n], _ANY_ACTION) for n in self._graph.needed([node]))
-            for node in found[0]
-        )
+        any_action = {cell.node for cell in unknown.cells.flat}
+        are_chosen = (not any_action.isdisjoint(self._graph.needed([node])) for node in found[0])
         return tuple(are_chosen), tuple(found[1])
 
 
@@ -260,7 +257,7 @@ class _Assembly:
         self._episode = env.inside.draws.draw(rng)
         self._starts = {**self._episode.variables, **decision.starts}
         self._drawn = set(env.inside.draws.drawn_names)
-        self._external = self._given(external)
+        self._external = found_in(env, external, self._graph, traced.observation)
         rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
         self._inputs = [
             (variable, node) for variable, node, is_chosen in rows if all_inputs or is_chosen
@@ -270,17 +267,6 @@ class _Assembly:
         self._kept: list[Kept] = []
         self._fields: dict[str, int] = {}
         self._parameters: list[Parameter] = []
-
-    def _given(self, names: Collection[str]) -> dict[int, Variable]:
-        """What the controller is given, by node; names differ from those of the plant's inputs."""
-        found = found_in(self._env, names, self._graph, self._traced.observation)
-        taken = {variable.name for variable in self._env.inside.interface.inputs}
-        return {
-            one.node: replace(one.variable, name=f"{one.variable.name}_given")
-            if one.variable.name in taken
-            else one.variable
-            for one in found
-        }
 
     def logic(self) -> Logic:
         """Find all that the features and the inputs depend on, from sample to sample."""
@@ -311,30 +297,29 @@ class _Assembly:
             interface.time_step,
         )
 
-    def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:
-        return (self._graph.nodes[number] for number in sorted(needed))
+    def _reads(self, needed: Iterable[int]) -> defaultdict[str, list[Any]]:
+        """What some nodes read, by kind: the rest of rows, and elements of actions."""
+        found = defaultdict(list)
+        for number in sorted(needed):
+            node = self._graph.nodes[number]
+            row: Any = node.what if node.kind == "row" else (node.kind, node.what)
+            found[row[0]].append(row[1:])
+        return found
 
     def _next_values(self, needed: Iterable[int]) -> Iterator[int]:
         """The nodes of what is kept for the next sample."""
-        for name in self._variables_in(needed):
+        reads = self._reads(needed)
+        for name, *_ in reads["before"]:
             yield from self._traced.updates.get(name, ())
-        if any(_is_row(node, "input") for node in self._nodes(needed)):
+        if reads["input"]:
             yield from self._traced.inputs
-        if any(node.kind in _PAST_ACTIONS for node in self._nodes(needed)):
+        if reads["action"] or reads["previous_action"]:
             yield from self._traced.action
-
-    def _variables_in(self, needed: Iterable[int]) -> list[str]:
-        rows = [node.what for node in self._nodes(needed) if _is_row(node, "before")]
-        return list(dict.fromkeys(row[1] for row in rows))  # type: ignore[index]  # rows are tuples
 
     def _measured(self, needed: Iterable[int]) -> list[int]:
         """The places of the values that are measured now, or were at the sample before."""
-        rows: set[Any] = {
-            node.what
-            for node in self._nodes(needed)
-            if _is_row(node, "output") or _is_row(node, "kept")
-        }
-        places = sorted({row[1] for row in rows})
+        reads = self._reads(needed)
+        places = sorted({place for (place,) in (*reads["output"], *reads["kept"])})
         interface = self._env.inside.interface
         for place in places:
             variable = (interface.outputs + interface.monitors)[place]
@@ -348,19 +333,19 @@ class _Assembly:
     # What is kept.
 
     def _add_fields(self, needed: set[int], places: list[int]) -> None:
-        nodes = list(self._nodes(needed))
-        if any(_is_row(node, "kept") for node in nodes):
+        reads = self._reads(needed)
+        if reads["kept"]:
             outputs = [self._output_node(place) for place in places]
             self._add("previous", np.dtype(np.float64), [0.0] * len(places), outputs)
-        if any(_is_row(node, "input") for node in nodes):
+        if reads["input"]:
             self._add("inputs", np.dtype(np.float64), self._first_inputs(), self._traced.inputs)
-        self._add_actions(nodes)
-        for name in self._variables_in(needed):
+        if reads["action"] or reads["previous_action"]:
+            self._add_actions(has_older=bool(reads["previous_action"]))
+        for name in dict.fromkeys(name for name, *_ in reads["before"]):
             self._add_variable(name)
-        for node in nodes:
-            what: Any = node.what
-            if _is_row(node, "parameter") and what[1] in self._drawn:
-                self._add_parameter(what[1])
+        for name, *_ in reads["parameter"]:
+            if name in self._drawn:
+                self._add_parameter(name)
 
     def _output_node(self, place: int) -> int:
         """The node of a measurement, which the graph gets if it has none yet."""
@@ -373,12 +358,10 @@ class _Assembly:
                 raise UntraceableError(f"it reads the input {name!r}, whose first value is drawn")
         return [float(given.get(name, start)) for name, start in self._env.inside.start_inputs]
 
-    def _add_actions(self, nodes: list[Node]) -> None:
+    def _add_actions(self, has_older: bool) -> None:
         space: Any = self._env.action_space
         dtype, first = np.dtype(space.dtype), np.ravel(self._env.inside.no_action)
-        has_older = any(node.kind == "previous_action" for node in nodes)
-        if any(node.kind in _PAST_ACTIONS for node in nodes):
-            self._add("action", dtype, first.tolist(), self._traced.action)
+        self._add("action", dtype, first.tolist(), self._traced.action)
         if has_older:
             last = [self._graph.load("action", i, dtype, 0).node for i in range(len(first))]
             self._add("previous_action", dtype, first.tolist(), last)
@@ -447,8 +430,3 @@ class _Assembly:
             case "parameter":
                 return "constant", float(self._episode.parameters[row[1]])
         raise UntraceableError(f"it reads {row[0]!r}, which a controller does not have")
-
-
-def _is_row(node: Node, kind: str) -> bool:
-    what: Any = node.what
-    return node.kind == "row" and what[0] == kind

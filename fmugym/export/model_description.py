@@ -153,7 +153,7 @@ class _Writer:
             "fmiVersion": self.version,
             "modelName": agent.name,
             self.token: token,
-            "description": agent.notes[0] if agent.notes else "",
+            "description": agent.notes[0],
             "generationTool": f"fmugym {agent.version}",
             "variableNamingConvention": "flat",
         }

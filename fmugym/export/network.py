@@ -98,13 +98,8 @@ class Scaling:
 
     def __call__(self, observation: Any) -> Any:
         """Normalize an observation of shape (k, ...), an array or symbols, with float64."""
-        rows = zip(observation, self.mean, self.divisor, self.limit, strict=True)
-        return np.stack(
-            [
-                np.clip((row.astype(np.float64) - mean) / divisor, -limit, limit)
-                for row, mean, divisor, limit in rows
-            ]
-        )
+        scaled = (observation.astype(np.float64).T - self.mean) / self.divisor
+        return np.clip(scaled, -self.limit, self.limit).T
 
 
 @dataclass(frozen=True)
@@ -206,10 +201,10 @@ class Network:
                 np.split(values, np.cumsum(self.parts)[:-1]), np.ravel(space.start), strict=True
             )
             return np.stack([np.argmax(part, axis=0) + start for part, start in pairs])
-        limits = zip(values, space.low.flat, space.high.flat, strict=True)
+        low, high = space.low.ravel(), space.high.ravel()
         if self.squashed:
-            return np.stack([low + 0.5 * (x + 1) * (high - low) for x, low, high in limits])
-        return np.stack([np.clip(x, low, high) for x, low, high in limits])
+            return (low + 0.5 * (values.T + 1) * (high - low)).T
+        return np.clip(values.T, low, high).T
 
 
 def network_of(modules: Any, space: spaces.Space[Any], **more: Any) -> Network:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import ConfigError
 from fmugym.export.c99 import field_names
 from fmugym.export.exportable import Agent
 from fmugym.export.names import new_file
 from fmugym.export.network import Activation, Network
 from fmugym.export.onnx_nodes import Nodes
-from fmugym.export.onnx_operations import computed, interpolated
+from fmugym.export.onnx_operations import Operations
 from fmugym.extras import imported
-from fmugym.vector.hooks.graph import Node
 
 __all__ = ["onnx_model", "write_onnx"]
 
@@ -65,19 +63,18 @@ class _Model:
     """Makes the model of one agent."""
 
     def __init__(self, agent: Agent) -> None:
-        self._agent, self._logic, self._graph = agent, agent.logic, agent.logic.graph
+        self._agent, self._logic = agent, agent.logic
         self._onnx, self._nodes = imported("onnx", "onnx"), Nodes()
         self._fields = field_names(agent)
-        self._names: dict[int, str] = {}
-        self._given: list[str] = []
+        logic, load = agent.logic, self._loaded
+        self._operations = Operations(self._nodes, logic.graph, logic.loads, load)
+        self._given = ""
 
     def model(self) -> Any:
         """The checked model."""
-        logic, updates = self._logic, [n for kept in self._logic.kept for n in kept.updates]
+        logic = self._logic
         if self._agent.network is not None:
-            self._evaluate(logic.features)
             self._given = self._network(self._agent.network)
-        self._evaluate([*logic.input_nodes, *updates])
         self._store("actions", logic.input_nodes, _DOUBLE)
         outputs = [self._value("actions", _DOUBLE, len(logic.inputs))]
         outputs += self._next_memory()
@@ -137,31 +134,7 @@ class _Model:
 
     # The program around the network. A value has the shape (N,), a constant none.
 
-    def _evaluate(self, numbers: Iterable[int]) -> None:
-        needed = set(self._graph.needed(numbers, self._logic.loads))
-        for number in sorted(needed - self._names.keys()):
-            self._names[number] = self._expression(number, self._graph.nodes[number])
-
-    def _expression(self, number: int, node: Node) -> str:
-        if number in self._logic.loads:
-            return self._loaded(number, node)
-        operands, what, nodes = [self._names[one] for one in node.operands], node.what, self._nodes
-        match node.kind:
-            case "constant":
-                return nodes.constant(node.number, node.dtype)
-            case "ufunc":
-                return computed(nodes, what, operands, self._graph.nodes[node.operands[0]].dtype)
-            case "cast":
-                return nodes.cast(operands[0], node.dtype)
-            case "where":
-                return nodes.add("Where", *operands)
-            case "take":
-                return nodes.add("Gather", nodes.tensor(self._graph.tables[what]), *operands)
-            case "interpolate":
-                return interpolated(nodes, operands[0], self._graph.tables[what])
-        raise ConfigError(f"an operation of kind {node.kind!r} cannot be exported to ONNX")
-
-    def _loaded(self, number: int, node: Node) -> str:
+    def _loaded(self, number: int) -> str:
         load, nodes = self._logic.loads[number], self._nodes
         match load[0]:
             case "measurement":
@@ -173,8 +146,8 @@ class _Model:
             case "active":
                 return nodes.add("Greater", _COUNT, nodes.constant(0, _WHOLE))
             case "given":
-                return self._given[load[1]]
-        return nodes.constant(load[1], node.dtype)
+                return self._column(self._given, load[1])
+        return nodes.constant(load[1], self._logic.graph.nodes[number].dtype)
 
     def _column(self, array: str, place: int) -> str:
         return self._nodes.add("Gather", array, self._nodes.constant(place, _WHOLE), axis=1)
@@ -186,32 +159,31 @@ class _Model:
         is_first = self._nodes.add("Equal", _COUNT, self._nodes.constant(0, _WHOLE))
         return self._nodes.add("Where", is_first, self._column("measurements", element), value)
 
-    def _rows(self, numbers: Iterable[int], dtype: np.dtype[Any]) -> str:
+    def _rows(self, numbers: Sequence[int], dtype: np.dtype[Any]) -> str:
         """Values side by side, shape (N, k)."""
         nodes = self._nodes
         shape, axis = nodes.add("Shape", _COUNT), nodes.tensor(np.array([1]))
         columns = []
-        for number in numbers:
-            value = self._names[number]
-            if self._graph.nodes[number].dtype != dtype:
+        for number, value in zip(numbers, self._operations.written(numbers), strict=True):
+            if self._logic.graph.nodes[number].dtype != dtype:
                 value = nodes.cast(value, dtype)
             columns.append(nodes.add("Unsqueeze", nodes.add("Expand", value, shape), axis))
         return nodes.add("Concat", *columns, axis=1)
 
-    def _store(self, name: str, numbers: Iterable[int], dtype: np.dtype[Any]) -> None:
+    def _store(self, name: str, numbers: Sequence[int], dtype: np.dtype[Any]) -> None:
         self._nodes.named("Identity", (self._rows(numbers, dtype),), name)
 
     # The network.
 
-    def _network(self, network: Network) -> list[str]:
-        """The last values of the network, each element of shape (N,)."""
+    def _network(self, network: Network) -> str:
+        """The last values of the network, shape (N, k)."""
         nodes, values = self._nodes, self._rows(self._logic.features, network.dtype)
         for layer in network.layers:
             weights, bias = nodes.tensor(layer.weights), nodes.tensor(layer.bias)
             values = nodes.add("Gemm", values, weights, bias, transB=1)
             for activation in layer.activations:
                 values = _activated(nodes, values, activation, network.dtype)
-        return [self._column(values, index) for index in range(sum(network.parts))]
+        return values
 
 
 def _activated(nodes: Nodes, values: str, activation: Activation, dtype: np.dtype[Any]) -> str:

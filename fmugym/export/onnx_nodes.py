@@ -25,7 +25,6 @@ class Nodes:
         self.nodes: list[Any] = []
         self.tensors: list[Any] = []
         self._known: dict[Any, str] = {}
-        self._lengths: dict[str, int] = {}
 
     def add(self, operation: str, *operands: str, **attributes: Any) -> str:
         """Add a node, and return the name of its result."""
@@ -58,9 +57,4 @@ class Nodes:
         if key not in self._known:
             self._known[key] = name = f"constant_{len(self.tensors)}"
             self.tensors.append(self._onnx.numpy_helper.from_array(values, name))
-            self._lengths[name] = values.size
         return self._known[key]
-
-    def length(self, name: str) -> int:
-        """How many elements a tensor has."""
-        return self._lengths[name]

@@ -6,212 +6,189 @@ Where ONNX Runtime has a function in float32 only, or not at all, it is composed
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any, Final
 
 import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.onnx_nodes import Nodes
+from fmugym.vector.hooks.graph import Cell, Graph, Node
+from fmugym.vector.hooks.program import letter_of, operation_of
+from fmugym.vector.hooks.symbols import Symbols
 
-__all__ = ["computed", "interpolated"]
+__all__ = ["Operations"]
 
-_SAME: Final[Mapping[Any, str]] = {
-    np.add: "Add",
-    np.subtract: "Sub",
-    np.multiply: "Mul",
-    np.divide: "Div",
-    np.less: "Less",
-    np.less_equal: "LessOrEqual",
-    np.equal: "Equal",
-    np.greater: "Greater",
-    np.greater_equal: "GreaterOrEqual",
-    np.minimum: "Min",
-    np.maximum: "Max",
-    np.power: "Pow",
-    np.float_power: "Pow",
-    np.absolute: "Abs",
-    np.negative: "Neg",
-    np.sqrt: "Sqrt",
-    np.exp: "Exp",
-    np.log: "Log",
-    np.sin: "Sin",
-    np.cos: "Cos",
-    np.tanh: "Tanh",
-    np.floor: "Floor",
-    np.ceil: "Ceil",
-    np.rint: "Round",
+_SAME: Final[Mapping[str, str]] = {
+    **{
+        name: name.capitalize()
+        for name in (
+            *("add", "less", "equal", "greater", "and", "or", "xor", "not"),
+            *("sqrt", "exp", "log", "sin", "cos", "tanh", "floor", "ceil"),
+        )
+    },
+    "subtract": "Sub",
+    "multiply": "Mul",
+    "divide": "Div",
+    "less_equal": "LessOrEqual",
+    "greater_equal": "GreaterOrEqual",
+    "minimum": "Min",
+    "maximum": "Max",
+    "power": "Pow",
+    "absolute": "Abs",
+    "negative": "Neg",
+    "rint": "Round",
 }
-"""Functions that ONNX has, for the same types of operands."""
+"""Operations that ONNX has, for the same types of operands."""
 
-_OF_FLAGS: Final[Mapping[Any, str]] = {
-    np.logical_and: "And",
-    np.bitwise_and: "And",
-    np.multiply: "And",
-    np.logical_or: "Or",
-    np.bitwise_or: "Or",
-    np.add: "Or",
-    np.logical_xor: "Xor",
-    np.bitwise_xor: "Xor",
-    np.not_equal: "Xor",
-    np.logical_not: "Not",
-    np.invert: "Not",
-}
-
-_ANGLES: Final[Mapping[Any, str]] = {np.arcsin: "Asin", np.arccos: "Acos", np.arctan: "Atan"}
+_ANGLES: Final[Mapping[str, str]] = {"arcsin": "Asin", "arccos": "Acos", "arctan": "Atan"}
 """Functions that ONNX Runtime computes with float32 only."""
 
 
-def computed(nodes: Nodes, ufunc: Any, operands: Sequence[str], dtype: np.dtype[Any]) -> str:
-    """A function of numpy as nodes.
-
-    Args:
-        nodes: Takes the nodes.
-        ufunc: The function.
-        operands: The names of its operands.
-        dtype: The type of these.
-
-    Returns:
-        The name of the result.
-
-    Raises:
-        ConfigError: If it cannot be written.
-    """
-    if dtype == np.bool_ and ufunc in _OF_FLAGS:
-        return nodes.add(_OF_FLAGS[ufunc], *operands)
-    if ufunc in _SAME and dtype != np.bool_:
-        return nodes.add(_SAME[ufunc], *operands)
-    if ufunc in _COMPOSED and dtype != np.bool_:
-        return _COMPOSED[ufunc](nodes, dtype, *operands)
-    if ufunc in _ANGLES and dtype.kind == "f":
-        narrow = nodes.cast(operands[0], np.dtype(np.float32))
-        return nodes.cast(nodes.add(_ANGLES[ufunc], narrow), dtype)
-    raise ConfigError(f"numpy.{ufunc.__name__} of type {dtype} cannot be exported to ONNX")
-
-
-def _remainder(nodes: Nodes, dtype: np.dtype[Any], a: str, b: str) -> str:
+def _remainder(a: Any, b: Any) -> Any:
     """The remainder with the sign of the divisor."""
-    if dtype.kind != "f":
-        return nodes.add("Mod", a, b)
-    rest, zero = nodes.add("Mod", a, b, fmod=1), nodes.constant(0.0, dtype)
-    differs = nodes.add("Xor", nodes.add("Less", rest, zero), nodes.add("Less", b, zero))
-    moves = nodes.add("And", nodes.add("Not", nodes.add("Equal", rest, zero)), differs)
-    return nodes.add("Where", moves, nodes.add("Add", rest, b), rest)
+    rest = np.fmod(a, b)
+    return np.where((rest != 0.0) & ((rest < 0.0) != (b < 0.0)), rest + b, rest)
 
 
-def _floor_divide(nodes: Nodes, dtype: np.dtype[Any], a: str, b: str) -> str:
-    rest = nodes.add("Sub", a, _remainder(nodes, dtype, a, b))
-    quotient = nodes.add("Div", rest, b)
-    return nodes.add("Round", quotient) if dtype.kind == "f" else quotient
-
-
-def _of_exponentials(sign: str) -> Callable[..., str]:
-    """The hyperbolic sine or cosine."""
-
-    def compose(nodes: Nodes, dtype: np.dtype[Any], x: str) -> str:
-        parts = nodes.add("Exp", x), nodes.add("Exp", nodes.add("Neg", x))
-        return nodes.add("Mul", nodes.add(sign, *parts), nodes.constant(0.5, dtype))
-
-    return compose
-
-
-def _log_of(make: Callable[[Nodes, str, str], str], factor: float = 1.0) -> Callable[..., str]:
-    """A factor times the logarithm of something made of the operand and 1."""
-
-    def compose(nodes: Nodes, dtype: np.dtype[Any], x: str) -> str:
-        log = nodes.add("Log", make(nodes, x, nodes.constant(1.0, dtype)))
-        return log if factor == 1.0 else nodes.add("Mul", log, nodes.constant(factor, dtype))
-
-    return compose
-
-
-def _root(nodes: Nodes, x: str, one: str, sign: str) -> str:
-    """X plus the root of x squared plus or minus 1."""
-    inner = nodes.add(sign, nodes.add("Mul", x, x), one)
-    return nodes.add("Add", x, nodes.add("Sqrt", inner))
-
-
-def _ratio(nodes: Nodes, x: str, one: str) -> str:
-    return nodes.add("Div", nodes.add("Add", one, x), nodes.add("Sub", one, x))
-
-
-def _hypot(nodes: Nodes, dtype: np.dtype[Any], a: str, b: str) -> str:
-    return nodes.add("Sqrt", nodes.add("Add", nodes.add("Mul", a, a), nodes.add("Mul", b, b)))
-
-
-def _arctan2(nodes: Nodes, dtype: np.dtype[Any], y: str, x: str) -> str:
+def _arctan2(y: Any, x: Any) -> Any:
     """2 atan(y / (r + x)), and pi on the negative axis."""
-    length = _hypot(nodes, dtype, x, y)
-    below = nodes.add("Add", length, x)
-    is_axis = nodes.add("Equal", below, nodes.constant(0.0, dtype))
-    safe = nodes.add("Where", is_axis, nodes.constant(1.0, dtype), below)
-    half = computed(nodes, np.arctan, [nodes.add("Div", y, safe)], dtype)
-    angle = nodes.add("Mul", half, nodes.constant(2.0, dtype))
-    is_zero = nodes.add("Equal", length, nodes.constant(0.0, dtype))
-    end = nodes.add("Where", is_zero, nodes.constant(0.0, dtype), nodes.constant(math.pi, dtype))
-    return nodes.add("Where", is_axis, end, angle)
+    length = np.hypot(x, y)
+    below = length + x
+    is_axis = below == 0.0
+    angle = 2.0 * np.arctan(y / np.where(is_axis, 1.0, below))
+    return np.where(is_axis, np.where(length == 0.0, 0.0, math.pi), angle)
 
 
-_COMPOSED: Final[Mapping[Any, Callable[..., str]]] = {
-    np.not_equal: lambda nodes, dtype, a, b: nodes.add("Not", nodes.add("Equal", a, b)),
-    np.remainder: _remainder,
-    np.floor_divide: _floor_divide,
-    np.fmod: lambda nodes, dtype, a, b: nodes.add("Mod", a, b, fmod=1),
-    np.hypot: _hypot,
-    np.arctan2: _arctan2,
-    np.tan: lambda nodes, dtype, x: nodes.add("Div", nodes.add("Sin", x), nodes.add("Cos", x)),
-    np.sinh: _of_exponentials("Sub"),
-    np.cosh: _of_exponentials("Add"),
-    np.arcsinh: _log_of(lambda nodes, x, one: _root(nodes, x, one, "Add")),
-    np.arccosh: _log_of(lambda nodes, x, one: _root(nodes, x, one, "Sub")),
-    np.arctanh: _log_of(_ratio, 0.5),
-    np.log1p: _log_of(lambda nodes, x, one: nodes.add("Add", x, one)),
-    np.log2: _log_of(lambda nodes, x, one: x, 1 / math.log(2)),
-    np.log10: _log_of(lambda nodes, x, one: x, 1 / math.log(10)),
-    np.expm1: lambda nodes, dtype, x: nodes.add(
-        "Sub", nodes.add("Exp", x), nodes.constant(1.0, dtype)
-    ),
-    np.exp2: lambda nodes, dtype, x: nodes.add("Pow", nodes.constant(2.0, dtype), x),
+_COMPOSED: Final[Mapping[str, Callable[..., Any]]] = {
+    "not_equal": lambda a, b: ~(a == b),
+    "remainder": _remainder,
+    "floor_divide": lambda a, b: np.rint((a - np.remainder(a, b)) / b),
+    "hypot": lambda a, b: np.sqrt(a * a + b * b),
+    "arctan2": _arctan2,
+    "tan": lambda x: np.sin(x) / np.cos(x),
+    "sinh": lambda x: 0.5 * (np.exp(x) - np.exp(-x)),
+    "cosh": lambda x: 0.5 * (np.exp(x) + np.exp(-x)),
+    "arcsinh": lambda x: np.log(x + np.sqrt(x * x + 1.0)),
+    "arccosh": lambda x: np.log(x + np.sqrt(x * x - 1.0)),
+    "arctanh": lambda x: 0.5 * np.log((1.0 + x) / (1.0 - x)),
+    "log1p": lambda x: np.log(x + 1.0),
+    "log2": lambda x: np.log(x) * (1 / math.log(2)),
+    "log10": lambda x: np.log(x) * (1 / math.log(10)),
+    "expm1": lambda x: np.exp(x) - 1.0,
+    "exp2": lambda x: np.power(2.0, x),
 }
+"""Functions of symbols, by others that ONNX has."""
 
 
-def interpolated(nodes: Nodes, x: str, table: Any) -> str:
-    """A value between those of a table, as ``numpy.interp`` finds it.
+class Operations:
+    """Writes what a graph computes as nodes of ONNX.
 
     Args:
         nodes: Takes the nodes.
-        x: Where to look.
-        table: The arguments, the values, and the values before the first and after the last.
+        graph: The operations. Those that make up others are added.
+        loads: The numbers of those that the model finds.
+        load: Returns the name of such a value.
     """
-    count = len(table) // 2 - 1
-    names = [nodes.tensor(part) for part in (table[:count], table[count : 2 * count])]
-    place = _place(nodes, x, names[0], count)
-    (low, high), (first, last) = (_neighbours(nodes, name, place) for name in names)
-    width = nodes.add("Sub", high, low)
-    is_end = nodes.add("Equal", width, nodes.constant(0.0, table.dtype))  # both are the last one
-    safe = nodes.add("Where", is_end, nodes.constant(1.0, table.dtype), width)
-    slope = nodes.add("Div", nodes.add("Sub", last, first), safe)
-    inside = nodes.add("Add", nodes.add("Mul", slope, nodes.add("Sub", x, low)), first)
-    for operation, edge, value in (("Less", 0, -2), ("Greater", count - 1, -1)):
-        outside = nodes.add(operation, x, nodes.constant(table[edge], table.dtype))
-        other = nodes.constant(table[value], table.dtype)
-        inside = nodes.add("Where", outside, other, inside)
-    return inside
 
+    def __init__(
+        self, nodes: Nodes, graph: Graph, loads: Container[int], load: Callable[[int], str]
+    ) -> None:
+        self._nodes, self._graph, self._loads, self._load = nodes, graph, loads, load
+        self._names: dict[int, str] = {}
 
-def _place(nodes: Nodes, x: str, arguments: str, count: int) -> str:
-    """The number of the last argument that is not above x."""
-    column = nodes.add("Unsqueeze", x, nodes.tensor(np.array([-1])))
-    reached = nodes.cast(nodes.add("GreaterOrEqual", column, arguments), np.dtype(np.int64))
-    axis = nodes.tensor(np.array([-1]))
-    number = nodes.add("ReduceSum", reached, axis, keepdims=0)
-    place = nodes.add("Sub", number, nodes.constant(1, np.dtype(np.int64)))
-    return nodes.add("Max", place, nodes.constant(0, np.dtype(np.int64)))
+    def written(self, numbers: Iterable[int]) -> list[str]:
+        """Write some operations, and those that they need; returns the names of their results.
 
+        Raises:
+            ConfigError: If one cannot be written.
+        """
+        numbers = list(numbers)
+        for number in self._graph.needed(numbers, self._loads):
+            if number not in self._names:
+                is_load = number in self._loads
+                name = self._load(number) if is_load else self._write(self._graph.nodes[number])
+                self._names[number] = name
+        return [self._names[number] for number in numbers]
 
-def _neighbours(nodes: Nodes, values: str, place: str) -> tuple[str, str]:
-    whole = np.dtype(np.int64)
-    following = nodes.add("Add", place, nodes.constant(1, whole))
-    last = nodes.constant(nodes.length(values) - 1, whole)
-    later = nodes.add("Min", following, last)
-    return nodes.add("Gather", values, place), nodes.add("Gather", values, later)
+    def _write(self, node: Node) -> str:
+        operands, what, nodes = [self._names[one] for one in node.operands], node.what, self._nodes
+        match node.kind:
+            case "constant":
+                return nodes.constant(node.number, node.dtype)
+            case "ufunc":
+                return self._function(what, node.operands)
+            case "cast":
+                return nodes.cast(operands[0], node.dtype)
+            case "where":
+                return nodes.add("Where", *operands)
+            case "take":
+                return nodes.add("Gather", nodes.tensor(self._graph.tables[what]), *operands)
+        return self._interpolated(node.operands[0], self._graph.tables[what])
+
+    def _function(self, ufunc: Any, numbers: Iterable[int]) -> str:
+        add, operands = self._nodes.add, [self._names[number] for number in numbers]
+        symbols = list(map(self._symbol, numbers))
+        dtype = symbols[0].dtype
+        operation = str(operation_of(ufunc, letter_of(dtype)))
+        match operation:
+            case "fmod d":
+                return add("Mod", *operands, fmod=1)
+            case "remainder q":
+                return add("Mod", *operands)
+            case "floor_divide q":
+                rest = add("Mod", *operands)
+                return add("Div", add("Sub", operands[0], rest), operands[1])
+        name, *_ = operation.split()
+        if name in _SAME:
+            return add(_SAME[name], *operands)
+        if name in _ANGLES:
+            narrow = self._nodes.cast(operands[0], np.dtype(np.float32))
+            return self._nodes.cast(add(_ANGLES[name], narrow), dtype)
+        if name in _COMPOSED:
+            return self._composed(_COMPOSED[name](*symbols))
+        raise ConfigError(f"numpy.{name} of type {dtype} cannot be exported to ONNX")
+
+    def _symbol(self, number: int) -> Symbols:
+        cell = np.array(Cell(number, None), object)
+        return Symbols(self._graph, cell, self._graph.nodes[number].dtype)
+
+    def _named(self, name: str) -> Symbols:
+        """A result of the model that the graph did not know."""
+        number = self._graph.load("node", name, np.float64, None).node
+        self._names[number] = name
+        return self._symbol(number)
+
+    def _composed(self, symbols: Any) -> str:
+        (name,) = self.written([symbols.cells.item().node])
+        return name
+
+    def _interpolated(self, number: int, table: Any) -> str:
+        """A value between those of a table, as ``numpy.interp`` finds it.
+
+        Args:
+            number: Where to look.
+            table: The arguments, the values, and the values before the first and after the last.
+        """
+        count, nodes, x = len(table) // 2 - 1, self._nodes, self._symbol(number)
+        place = self._place(self._names[number], nodes.tensor(table[:count]))
+        following = nodes.add("Add", place, nodes.constant(1, np.dtype(np.int64)))
+        after = nodes.add("Min", following, nodes.constant(count - 1, np.dtype(np.int64)))
+        low, high, first, last = (
+            self._named(nodes.add("Gather", nodes.tensor(part), one))
+            for part in (table[:count], table[count : 2 * count])
+            for one in (place, after)
+        )
+        width = high - low
+        slope = (last - first) / np.where(width == 0.0, 1.0, width)  # both are the last one
+        inside = np.where(x < table[0], table[-2], slope * (x - low) + first)
+        return self._composed(np.where(x > table[count - 1], table[-1], inside))
+
+    def _place(self, x: str, arguments: str) -> str:
+        """The number of the last argument that is not above x; of the first one if all are."""
+        add, axis = self._nodes.add, self._nodes.tensor(np.array([-1]))
+        reached = add("GreaterOrEqual", add("Unsqueeze", x, axis), arguments)
+        whole = np.dtype(np.int64)
+        number = add("ReduceSum", self._nodes.cast(reached, whole), axis, keepdims=0)
+        place = add("Sub", number, self._nodes.constant(1, whole))
+        return add("Max", place, self._nodes.constant(0, whole))

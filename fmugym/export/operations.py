@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from fmugym.errors import ConfigError
+from fmugym.vector.hooks.program import letter_of, operation_of
 
 __all__ = ["HELPERS", "TYPES", "constant", "expression"]
 
@@ -20,74 +21,41 @@ TYPES: Final[Mapping[str, str]] = {
 }
 """C's types by numpy's letters."""
 
-_INFIX: Final[Mapping[Any, str]] = {
-    np.add: "+",
-    np.subtract: "-",
-    np.multiply: "*",
-    np.divide: "/",
-    np.less: "<",
-    np.less_equal: "<=",
-    np.greater: ">",
-    np.greater_equal: ">=",
-    np.equal: "==",
-    np.not_equal: "!=",
-    np.logical_and: "&&",
-    np.logical_or: "||",
+_INFIX: Final[Mapping[str, str]] = {
+    "add": "+",
+    "subtract": "-",
+    "multiply": "*",
+    "divide": "/",
+    "less": "<",
+    "less_equal": "<=",
+    "greater": ">",
+    "greater_equal": ">=",
+    "equal": "==",
+    "not_equal": "!=",
+    "and": "&&",
+    "or": "||",
+    "xor": "!=",
+    "bitwise_and": "&",
+    "bitwise_xor": "^",
+    "right_shift": ">>",
 }
-_OF_BOOLEANS: Final[Mapping[Any, str]] = {
-    np.bitwise_and: "&&",
-    np.bitwise_or: "||",
-    np.bitwise_xor: "!=",
-    np.logical_xor: "!=",
-    np.add: "||",
-    np.multiply: "&&",
-}
-_OF_INTEGERS: Final[Mapping[Any, str]] = {
-    np.bitwise_and: "&",
-    np.bitwise_xor: "^",
-    np.right_shift: ">>",
-}
+_PREFIX: Final[Mapping[str, str]] = {"negative": "-", "not": "!"}
 
-_OF_MATH: Final[Mapping[Any, str]] = {
-    **{getattr(np, name): name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "hypot")},
-    **{getattr(np, name): name for name in ("exp", "exp2", "expm1", "log", "log2", "log10")},
-    **{getattr(np, name): name for name in ("log1p", "sqrt", "cbrt", "floor", "ceil", "trunc")},
-    np.rint: "rint",
-    np.fmod: "fmod",
-    np.copysign: "copysign",
-    np.arcsin: "asin",
-    np.arccos: "acos",
-    np.arctan: "atan",
-    np.arctan2: "atan2",
-    np.arcsinh: "asinh",
-    np.arccosh: "acosh",
-    np.arctanh: "atanh",
-    np.power: "pow",
-    np.float_power: "pow",
-    np.absolute: "fabs",
-}
-"""Functions of the C library for numbers of floating point."""
-
-
-_OWN: Final[Mapping[Any, str]] = {
-    np.minimum: "minimum",
-    np.maximum: "maximum",
-    np.remainder: "remainder",
-    np.floor_divide: "floor_divide",
-}
+_OF_MATH: Final[Mapping[str, str]] = {"power": "pow", "absolute": "fabs"}
+"""Functions of the C library whose names differ from numpy's by more than ``arc``."""
 
 HELPERS: Final[Mapping[str, str]] = {
     "minimum": "{T} {name}({T} a, {T} b) {{\n    return (a < b || a != a) ? a : b;\n}}",
     "maximum": "{T} {name}({T} a, {T} b) {{\n    return (a > b || a != a) ? a : b;\n}}",
     "remainder": (
-        "{T} {name}({T} a, {T} b) {{\n    const {T} r = fmod{f}(a, b);\n"
-        "    if (r == 0) {{\n        return copysign{f}(0, b);\n    }}\n"
+        "{T} {name}({T} a, {T} b) {{\n    const {T} r = fmod(a, b);\n"
+        "    if (r == 0) {{\n        return copysign(0, b);\n    }}\n"
         "    return ((r < 0) != (b < 0)) ? r + b : r;\n}}"
     ),
     "floor_divide": (
-        "{T} {name}({T} a, {T} b) {{\n    const {T} r = fmod{f}(a, b);\n"
+        "{T} {name}({T} a, {T} b) {{\n    const {T} r = fmod(a, b);\n"
         "    const {T} q = (a - r) / b - ((r != 0 && (r < 0) != (b < 0)) ? 1 : 0);\n"
-        "    const {T} whole = floor{f}(q);\n    return (q - whole > 0.5) ? whole + 1 : whole;\n}}"
+        "    const {T} whole = floor(q);\n    return (q - whole > 0.5) ? whole + 1 : whole;\n}}"
     ),
     "interpolate": (
         "{T} {name}({T} x, const {T} *xs, const {T} *ys, int count) {{\n"
@@ -101,7 +69,7 @@ HELPERS: Final[Mapping[str, str]] = {
         "    return (ys[high] - ys[low]) / (xs[high] - xs[low]) * (x - xs[low]) + ys[low];\n}}"
     ),
 }
-"""Functions that the C library lacks, as numpy computes them. ``f`` is its suffix for the type."""
+"""Functions that the C library lacks, as numpy computes them."""
 
 
 def constant(value: Any, letter: str) -> str:
@@ -127,45 +95,31 @@ def _float(value: Any, letter: str) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def expression(ufunc: Any, operands: Sequence[str], letters: str, use: Any) -> str:
+def expression(
+    ufunc: Any, operands: Sequence[str], dtype: np.dtype[Any], use: Callable[[str, str], str]
+) -> str:
     """A function of numpy as an expression.
 
     Args:
-        ufunc: The function.
+        ufunc: A function that programs have for this type, see ``operation_of``.
         operands: The expressions of its operands, in parentheses where needed.
-        letters: Their types.
+        dtype: Their type.
         use: A function that notes a helper, for a letter, and returns its name.
 
     Raises:
         ConfigError: If it cannot be written.
     """
-    kind = letters[0]
-    infix = (_OF_BOOLEANS if kind == "?" else _OF_INTEGERS if kind not in "df" else {}).get(ufunc)
-    infix = infix or (None if kind == "?" and ufunc is np.subtract else _INFIX.get(ufunc))
-    if infix is not None:
-        return f"({operands[0]} {infix} {operands[1]})"
-    if kind in "df":
-        text = _of_floats(ufunc, operands, kind, use)
+    letter = letter_of(dtype)
+    name, *_ = str(operation_of(ufunc, letter)).split()
+    if name in _INFIX:
+        return f"({operands[0]} {_INFIX[name]} {operands[1]})"
+    if name in _PREFIX:
+        return f"({_PREFIX[name]}{operands[0]})"
+    if letter == "q" and name not in {"minimum", "maximum"}:
+        raise ConfigError(f"numpy.{name} of type {dtype} cannot be exported to C")
+    if name in HELPERS:
+        function = use(name, letter)
     else:
-        text = _of_whole_numbers(ufunc, operands, kind, use)
-    if text is None:
-        raise ConfigError(f"numpy.{ufunc.__name__} of type {np.dtype(kind)} cannot be exported")
-    return text
-
-
-def _of_floats(ufunc: Any, operands: Sequence[str], kind: str, use: Any) -> str | None:
-    arguments = ", ".join(operands)
-    if ufunc in _OWN:
-        return f"{use(_OWN[ufunc], kind)}({arguments})"
-    if ufunc in _OF_MATH:
-        return f"{_OF_MATH[ufunc]}{'f' if kind == 'f' else ''}({arguments})"
-    return f"(-{operands[0]})" if ufunc is np.negative else None
-
-
-def _of_whole_numbers(ufunc: Any, operands: Sequence[str], kind: str, use: Any) -> str | None:
-    first = operands[0]
-    if kind == "?":
-        return f"(!{first})" if ufunc in {np.logical_not, np.invert} else None
-    if ufunc in {np.minimum, np.maximum}:
-        return f"{use(_OWN[ufunc], kind)}({', '.join(operands)})"
-    return f"(-{first})" if ufunc is np.negative else None
+        suffix = "f" if letter == "f" else ""
+        function = _OF_MATH.get(name, name.replace("arc", "a")) + suffix
+    return f"{function}({', '.join(operands)})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
@@ -130,21 +131,18 @@ def _require_flat(extractor: Any) -> None:
         raise ConfigError(f"a policy whose features come from {names} cannot be exported")
 
 
-def _scaling(normalization: Any, space: spaces.Space[Any]) -> Scaling:
+def _scaling(normalization: Any, space: Any) -> Scaling:
     """The normalization of each element of an observation, parts of dicts side by side."""
-    rms, epsilon = normalization.obs_rms, normalization.epsilon
-    if not isinstance(space, spaces.Dict):
-        limit = np.full(rms.mean.size, normalization.clip_obs)
-        return Scaling(rms.mean.ravel(), np.sqrt(rms.var + epsilon).ravel(), limit)
-    parts: list[tuple[Any, Any, Any]] = []
-    for name, part in space.spaces.items():
-        size = int(np.prod(part.shape or ()))
-        if name in (normalization.norm_obs_keys or ()):
-            mean, var = rms[name].mean.ravel(), rms[name].var.ravel()
-            parts.append((mean, np.sqrt(var + epsilon), np.full(size, normalization.clip_obs)))
-        else:
-            parts.append((np.zeros(size), np.ones(size), np.full(size, np.inf)))
-    return Scaling(*(np.concatenate(rows) for rows in zip(*parts, strict=True)))
+    is_dict, rms = isinstance(space, spaces.Dict), normalization.obs_rms
+    parts, known = (dict(space), rms) if is_dict else ({"": space}, {"": rms})
+    rows = []
+    for name, part in parts.items():
+        row = [0.0, 1.0, np.inf]
+        if name in known:
+            divisor = np.sqrt(known[name].var + normalization.epsilon)
+            row = [known[name].mean.ravel(), divisor.ravel(), normalization.clip_obs]
+        rows.append([np.broadcast_to(one, math.prod(part.shape)) for one in row])
+    return Scaling(*map(np.concatenate, zip(*rows, strict=True)))
 
 
 def _require_same(model: Any, normalization: Any, network: Network) -> None:

@@ -97,8 +97,8 @@ class Cell:
         self,
         experiment: str,
         position: Sequence[float],
-        disturbances: Sequence[Disturbance] = (),
-        recording: Recording | None = None,
+        disturbances: Sequence[Disturbance],
+        recording: Recording | None,
     ) -> None:
         """Bring the arm to its start position and release it.
 
@@ -118,7 +118,6 @@ class Cell:
             if math.isfinite(self.options.hold_stiffness):
                 self._hold(position)
         self.velocity = [0.0] * self.plant.joints
-        self.torque = [0.0] * self.plant.joints
         self.drive = Drive(self.options, spec.driven)
         self._disturbances = [Acting(each) for each in disturbances]
         self.recording = recording

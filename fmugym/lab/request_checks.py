@@ -17,9 +17,8 @@ from fmugym.checks import (
     check_option,
     check_text,
     float_or_nan,
-    number_of,
 )
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import shown
 from fmugym.lab.data import CellType, LabError, as_lab_error
 from fmugym.lab.disturbance import Disturbance, resolve
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
@@ -47,11 +46,11 @@ class Request:
 
     experiment_type: str
     length: float
-    preparation_time: float = 0.0
-    position: Any = None
-    record: bool = False
-    cell_id: int | None = None
-    disturbances: str | Disturbance | Sequence[Disturbance] | None = None
+    preparation_time: float
+    position: Any
+    record: bool
+    cell_id: int | None
+    disturbances: str | Disturbance | Sequence[Disturbance] | None
 
     def __post_init__(self) -> None:
         with as_lab_error():
@@ -183,10 +182,5 @@ def gains_of(value: Any, joints: int, name: str) -> list[float | None]:
 
 
 def _finite(entry: Any, name: str) -> float:
-    try:
-        number = number_of(name, entry, may_be_boolean=True)
-    except ConfigError:
-        raise LabError(f"{name} must be a number for each joint, not {shown(entry)}") from None
-    if not math.isfinite(number):
-        raise LabError(f"{name} must be finite, not {shown(entry)}")
-    return number
+    with as_lab_error():
+        return check_number(f"each entry of {name}", entry, may_be_boolean=True)

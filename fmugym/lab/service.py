@@ -20,7 +20,7 @@ from fmugym.checks import check_dict, check_integer, check_option
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.bookings import Bookings, new_token
 from fmugym.lab.cell import Cell, checked_parameters
-from fmugym.lab.cell_pictures import CellPicture, LiveView
+from fmugym.lab.cell_pictures import CellFrame, CellPicture, LiveView
 from fmugym.lab.data import CellInfo, CellType, LabError, UserInfo, as_lab_error
 from fmugym.lab.presets import Options, make_options
 from fmugym.lab.request_checks import Request, cell_types_of, check_range, text_of
@@ -218,8 +218,8 @@ class Service:
             if gym.view is None:
                 gym.view = LiveView([self._picture(cell) for cell in gym.cells])
             view = gym.view
-            moments = [(cell.position, cell.torque, cell.time) for cell in gym.cells]
-        picture = view.draw(moments)
+            frames = [CellFrame(cell.position, cell.torque, cell.time) for cell in gym.cells]
+        picture = view.draw(frames)
         if mode == "rgb_array":
             return picture
         with as_lab_error():

@@ -9,7 +9,14 @@ from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from fmugym.checks import check_flag, check_integer, check_number, check_option, check_text
+from fmugym.checks import (
+    check_flag,
+    check_integer,
+    check_mapping,
+    check_number,
+    check_option,
+    check_text,
+)
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.data import LabError, UserInfo
 from fmugym.lab.experiments import EXPERIMENTS
@@ -233,12 +240,11 @@ class Accounts:
 
 
 def _checked_users(users: Any) -> dict[str, User]:
-    if not isinstance(users, Mapping):
-        raise ConfigError(f"users must be a dict of users by their tokens, not {shown(users)}")
-    for token, user in users.items():
-        if not isinstance(token, str) or not isinstance(user, User):
-            raise ConfigError(f"users: expected a text and a User, not {shown((token, user))}")
-    return {str.__str__(token): user for token, user in users.items()}
+    found = check_mapping("users", users)
+    for token, user in found.items():
+        if not isinstance(user, User):
+            raise ConfigError(f"users: expected a User for {shown(token)}, not {shown(user)}")
+    return found
 
 
 def _later(date: datetime, seconds: float) -> datetime:

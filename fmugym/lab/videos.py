@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import installation
-from fmugym.lab.cell_pictures import CellPicture
+from fmugym.lab.cell_pictures import CellFrame, CellPicture
 from fmugym.lab.data import LabError
 from fmugym.signals import ordinary
 
@@ -152,7 +152,7 @@ def _write_video(recording: Recording, picture: CellPicture, folder: Path, name:
 
 def _frames(recording: Recording, picture: CellPicture) -> Iterable[Frame]:
     for index, moment in enumerate(recording.moments):
-        yield picture.draw(*moment, index / FRAME_RATE, _SIZE)
+        yield picture.picture(CellFrame(*moment, index / FRAME_RATE), _SIZE)
 
 
 def _write_mp4(frames: Iterable[Frame], path: Path) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -58,9 +58,8 @@ class _Trials(NamedTuple):
 
     def take(self, places: IndexArray) -> _Trials:
         """Some of them."""
-        return _Trials(
-            self.at[places], self.starts[places], self.states[places], self.actions[places]
-        )
+        parts: Iterator[Any] = (part[places] for part in self)
+        return _Trials(*parts)
 
 
 def differentiate_by_starts(
@@ -201,11 +200,10 @@ class _Perturbation:
         *moved, widths = (
             array.reshape(horizon, size) for array in moved_both_ways(self._space, nominal, step)
         )
+        i, j = np.arange(n), np.arange(size)
         for way, sign in enumerate((1.0, -1.0)):
-            for i in range(n):
-                states[:, 1 + 2 * i + way, i] += sign * deltas[i]
-            for j in range(size):
-                actions[:, 1 + 2 * n + 2 * j + way, j] = moved[way][:, j]
+            states[:, 1 + 2 * i + way, i] += sign * deltas
+            actions[:, 1 + 2 * n + 2 * j + way, j] = moved[way]
         starts = np.tile(np.arange(each) < 1 + 2 * n, horizon)
         trials = _Trials(
             np.repeat(np.arange(horizon), each),

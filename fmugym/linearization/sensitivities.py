@@ -18,7 +18,9 @@ __all__ = [
     "Derivatives",
     "checked_trajectory",
     "derivatives",
+    "differences",
     "float_box",
+    "moved_alone",
     "moved_both_ways",
     "precise_step",
     "require_vector",
@@ -77,7 +79,7 @@ def derivatives(
     checked_snapshot(snapshot, length=1)
     nominal = checked_trajectory(space, actions)
     delta = precise_step(seen) if step is None else check_number("step", step, positive=True)
-    candidates, widths = _moved(space, nominal, delta)
+    candidates, widths = moved_alone(space, nominal, delta)
     found = envs.rollout(snapshot, candidates)
     if found.lengths.min() < len(nominal):
         raise SimulationError(
@@ -85,7 +87,7 @@ def derivatives(
             "exist for trajectories without an end only"
         )
     outputs = np.asarray(found.observations, np.float64).reshape(len(candidates), len(nominal), -1)
-    by_actions, of_rewards = _differences(outputs, widths), _differences(found.rewards, widths)
+    by_actions, of_rewards = differences(outputs, widths), differences(found.rewards, widths)
     shape = len(nominal), nominal[0].size
     return Derivatives(
         found.observations[0].reshape(len(nominal), -1),
@@ -145,7 +147,7 @@ def require_vector(envs: Any, name: str) -> None:
     require_open(envs, name)
 
 
-def _moved(
+def moved_alone(
     space: spaces.Box, nominal: npt.NDArray[Any], step: float
 ) -> tuple[npt.NDArray[Any], FloatArray]:
     """The nominal actions, then two candidates for each element; and how far these are apart."""
@@ -182,8 +184,13 @@ def moved_both_ways(
     return up, down, np.subtract(up, down, dtype=np.float64)
 
 
-def _differences(values: npt.NDArray[Any], widths: FloatArray) -> FloatArray:
-    """The differences of each pair of candidates, divided by how far they are apart."""
+def differences(values: npt.NDArray[Any], widths: FloatArray) -> FloatArray:
+    """The differences of each pair of candidates, divided by how far they are apart.
+
+    Args:
+        values: What the candidates of ``moved_alone`` lead to, in their order.
+        widths: How far they are apart.
+    """
     pairs = values[1:].reshape(len(widths), 2, *values.shape[1:])
     apart = widths.reshape(-1, *[1] * (values.ndim - 1))
     quotients: FloatArray = (pairs[:, 0] - pairs[:, 1]) / apart

@@ -17,7 +17,9 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.linearization.perturbations import Matrices, differentiate_by_starts
 from fmugym.linearization.sensitivities import (
     checked_trajectory,
+    differences,
     float_box,
+    moved_alone,
     moved_both_ways,
     precise_step,
     require_vector,
@@ -263,8 +265,6 @@ class _Follower:
     def __init__(self, env: FMUEnv, states: States) -> None:
         description = env.fmu.description
         self._env, self._pool = env, env.inside.pool
-        spec = env.inside.spec
-        self._time_step = spec.substeps * spec.communication_step_size
         self._x = tuple(map(description.variable, states))
         slopes = description.state_derivatives
         self._x_dot = tuple(description.variable(slopes[name]) for name in states)
@@ -283,7 +283,7 @@ class _Follower:
             x.append(self._read())
             y.append(self._pool.outputs[: len(self._y), 0].copy())
         slopes, outputs, by_actions = map(np.array, zip(*rows, strict=True))
-        a, b = discrete(slopes, self._time_step)
+        a, b = discrete(slopes, self._env.inside.spec.time_step)
         by_x, by_u = outputs[:, :, :n], outputs[:, :, n:]
         d = (by_x @ b + by_u) @ by_actions
         return Matrices(a, b @ by_actions, by_x @ a, d, np.array(x), np.array(y))
@@ -363,21 +363,9 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
         Shape (inputs, actions).
     """
     space = float_box(env.action_space, "action")
-    up, down, widths = moved_both_ways(space, action[None], precise_step(space))
-    slopes = np.empty((len(env.inside.spec.inputs), action.size))
-    for column in range(action.size):
-        ends = (_inputs_of(env, _replaced(action, column, one)) for one in (up, down))
-        upper, lower = map(np.array, ends)
-        slopes[:, column] = (upper - lower) / widths.flat[column]
-    _inputs_of(env, action)
-    return slopes
-
-
-def _replaced(action: npt.NDArray[Any], column: int, other: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """An action with one number of another one."""
-    moved = np.array(action)
-    moved.flat[column] = other.flat[column]
-    return moved
+    actions, widths = moved_alone(space, action[None], precise_step(space))
+    inputs = [_inputs_of(env, one[0]) for one in actions[::-1]]  # that of the action is the last
+    return differences(np.array(inputs[::-1]), widths).T
 
 
 def _inputs_of(env: FMUEnv, action: Any) -> tuple[float, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -17,10 +17,31 @@ from fmugym.errors import unknown_name
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.task.quantity import TEXT_KINDS, Quantities, Quantity
 
-__all__ = ["Choice", "choose", "flat", "matches", "quantities_of"]
+__all__ = ["Choice", "Episodes", "choose", "matches", "quantities_of"]
 
 _VARYING: Final = ("continuous", "discrete")
 _PARAMETERS: Final = ("parameter", "text parameter")
+
+
+class Episodes(Protocol):
+    """N environments to read.
+
+    Attributes:
+        prototype: One of them.
+        count: N.
+        is_vector: Whether they are those of a vector environment.
+    """
+
+    prototype: FMUEnv
+    count: int
+    is_vector: bool
+
+    def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
+        """Evaluate a function of M of the environments; shape (k, M)."""
+
+    @property
+    def pool(self) -> Pool:
+        """Reads variables of the FMUs."""
 
 
 class Choice(NamedTuple):
@@ -40,33 +61,35 @@ class Choice(NamedTuple):
     variables: tuple[Variable, ...]
     observed: tuple[int, ...]
 
-    def present(self, values: FloatArray, pool: Pool, indices: Any) -> FloatArray:
+    def present(self, episodes: Episodes, indices: Any) -> FloatArray:
         """What M environments have at this moment, all but the observations.
 
         Args:
-            values: All of the task's quantities, shape (k, M).
-            pool: Reads variables of the FMU.
+            episodes: All environments.
             indices: The M environments.
 
         Returns:
             One row for each environment, one column for each quantity.
         """
-        rows = [values[list(self.places)]]
+        rows = [episodes.evaluate(self.read, indices)[list(self.places)]]
         if self.variables:
-            rows.append(pool.read(self.variables)[:, indices])
+            rows.append(episodes.pool.read(self.variables)[:, indices])
         return np.concatenate(rows).T
 
-    def seen(self, observations: FloatArray, indices: Any) -> FloatArray:
-        """What M environments observe.
+    def seen(self, observations: Any, indices: Any) -> FloatArray:
+        """What M environments observe; nothing if observations are no arrays.
 
         Args:
-            observations: Those of all environments, shape (N, m).
+            observations: Those of all environments.
             indices: The M environments.
 
         Returns:
             One row for each environment, one column for each element.
         """
-        chosen: FloatArray = observations[indices][:, list(self.observed)]
+        if not isinstance(observations, np.ndarray):
+            return np.empty((len(indices), 0))
+        rows = observations[indices].reshape(len(indices), -1)
+        chosen: FloatArray = rows[:, list(self.observed)].astype(np.float64)
         return chosen
 
 
@@ -214,10 +237,3 @@ def _observation_names(env: FMUEnv) -> Sequence[str]:
     if isinstance(space, spaces.Box):
         return [str(index) for index in range(int(np.prod(space.shape)))]
     return []
-
-
-def flat(observations: Any, count: int) -> FloatArray:
-    """The observations of N environments as numbers, shape (N, m); without numbers, m is 0."""
-    if not isinstance(observations, np.ndarray):
-        return np.empty((count, 0))
-    return observations.reshape(count, -1).astype(np.float64)

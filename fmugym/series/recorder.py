@@ -16,8 +16,8 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
-from fmugym.series.choice import choose
-from fmugym.series.rows import Episodes, Infos, Outcome, Rows, batched, present
+from fmugym.series.choice import Episodes, choose
+from fmugym.series.rows import Infos, Outcome, Rows, batched
 from fmugym.series.store import Block, Memory, Store, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
@@ -31,7 +31,6 @@ class _Recorder:
     Args:
         episodes: The environments.
         variables, environments, every, path, most_rows: See the wrappers.
-        is_vector: Whether there may be many.
     """
 
     def __init__(
@@ -42,9 +41,8 @@ class _Recorder:
         every: float | None,
         path: str | os.PathLike[str] | None,
         most_rows: int,
-        is_vector: bool,
     ) -> None:
-        self.episodes, self._is_vector = episodes, is_vector
+        self.episodes = episodes
         patterns = [variables] if isinstance(variables, str) else variables
         self._choice = choose(episodes.prototype, patterns)
         self._indices = _chosen(environments, episodes.count)
@@ -54,40 +52,34 @@ class _Recorder:
         self._memory: Memory | None = None
         self._stores: list[Store] = []
         self.has_begun = False
-        self._steps: Any = None
 
     def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> None:
         """Write down that episodes have begun."""
         self._open(infos)
         self._add(self._rows.begin(mask, infos, observations))
 
-    def go_on(self, steps: Any) -> None:
-        """Begin in the middle of episodes that have had so many steps, shape (N,)."""
-        self.has_begun, self._steps = True, steps
-
-    def _open(self, infos: Infos) -> None:
-        if self._memory is not None:
+    def _open(self, infos: Infos, steps: Any = None) -> None:
+        """Find the columns; in the middle of episodes, these have had so many steps, shape (N,)."""
+        if self.has_begun:
             return
         self.has_begun = True
-        self._rows = Rows(
-            self.episodes, self._choice, self._indices, self._every, self._is_vector, infos
-        )
-        if self._steps is not None:
-            self._rows.go_on(self._steps)
+        self._rows = Rows(self.episodes, self._choice, self._indices, self._every, infos)
+        if steps is not None:
+            self._rows.go_on(steps)
         if self._path is not None:
             self._stores.append(open_store(self._path, self._rows.columns))
             weakref.finalize(self, self._stores[0].close)
         self._memory = Memory(self._rows.columns, self._most_rows)
         self._stores.append(self._memory)
 
-    def add(self, outcome: Outcome, idle: MaskArray) -> None:
-        """Write down a step."""
-        self._open(outcome.infos)
+    def add(self, outcome: Outcome, idle: MaskArray, steps: Any) -> None:
+        """Write down a step, before which episodes had so many steps, shape (N,)."""
+        self._open(outcome.infos, steps)
         self._add(self._rows.add(outcome, idle))
 
     def present(self) -> FloatArray:
-        """What the environments have at this moment; see ``Rows.present``."""
-        return present(self.episodes, self._choice, self._indices)
+        """What the environments have at this moment; see ``Choice.present``."""
+        return self._choice.present(self.episodes, self._indices)
 
     def _add(self, block: Block) -> None:
         for store in self._stores if len(block) else ():
@@ -131,6 +123,8 @@ def _steps_of(every: float | None, time_step: float) -> int:
 
 class _One:
     """A single environment, as ``Episodes``."""
+
+    is_vector = False
 
     def __init__(self, env: FMUEnv) -> None:
         self.prototype, self.count = env, 1
@@ -181,7 +175,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not isinstance(inner, FMUEnv):
             raise ConfigError(f"steps of an FMUEnv can be recorded, got {shown(env)}")
         super().__init__(env)
-        self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows, False)
+        self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows)
 
     @property
     def series(self) -> TimeSeries:
@@ -206,9 +200,8 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
         infos, seen = Infos(batched(info), 1), _batch(observation)
-        if not self._recorder.has_begun:
-            self._recorder.go_on(self._recorder.episodes.prototype.step_count - 1)
-        self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)
+        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen, no)
+        self._recorder.add(outcome, no, self._recorder.episodes.prototype.step_count - 1)
         return observation, reward, terminated, truncated, info
 
     def complete(self) -> None:
@@ -227,6 +220,8 @@ def _batch(observation: Any) -> Any:
 
 class _Many:
     """The environments of a vector environment, as ``Episodes``."""
+
+    is_vector = True
 
     def __init__(self, envs: FMUVectorEnv) -> None:
         self._inside, self.prototype, self.count = envs.inside, envs.inside.prototype, envs.num_envs
@@ -271,10 +266,9 @@ class RecordVectorSeries(VectorWrapper):
         super().__init__(env)
         self._mode, self._envs = env.autoreset_mode, _Many(env)
         self._ended = np.zeros(env.num_envs, np.bool_)
-        self._recorder = _Recorder(
-            self._envs, variables, environments, every, path, most_rows, True
-        )
+        self._recorder = _Recorder(self._envs, variables, environments, every, path, most_rows)
         self._at_end: FloatArray | None = None
+        self._steps: Any = None
         if self._mode is AutoresetMode.SAME_STEP:
             env.inside.look_at_ends(self._look)
 
@@ -313,11 +307,11 @@ class RecordVectorSeries(VectorWrapper):
         return self._noted(actions, self.env.step(actions))
 
     def _go_on(self) -> None:
-        """Begin in the middle of episodes, if there was no reset."""
+        """Count the steps of episodes in the middle of which the recording begins."""
         envs: Any = self.env
         if not self._recorder.has_begun and envs.inside.episodes.started:
-            counts = self._envs.evaluate(lambda env: (env.step_count,), np.arange(self.num_envs))
-            self._recorder.go_on(counts[0])
+            everywhere = np.arange(self.num_envs)
+            (self._steps,) = self._envs.evaluate(lambda env: (env.step_count,), everywhere)
 
     def step_async(self, actions: Any) -> None:
         """Begin a step; see ``FMUVectorEnv.step_async``."""
@@ -340,7 +334,8 @@ class RecordVectorSeries(VectorWrapper):
         if same_step:
             last, seen = self._last(infos, observations, ended)
         at_end = self._at_end if same_step else None
-        self._recorder.add(Outcome(rewards, terminated, truncated, last, seen, ended, at_end), idle)
+        outcome = Outcome(rewards, terminated, truncated, last, seen, ended, at_end)
+        self._recorder.add(outcome, idle, self._steps)
         begun = ended if same_step else idle
         self._ended = none if same_step else ended
         if begun.any():

@@ -2,44 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Protocol
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.texts import text_of
-from fmugym.env import FMUEnv
-from fmugym.pool.base import FloatArray, MaskArray, Pool
-from fmugym.series.choice import Choice, flat
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.series.choice import Choice, Episodes
 from fmugym.series.store import Block
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 from fmugym.task.starting import start_time_of
 
-__all__ = ["Episodes", "Infos", "Outcome", "Rows", "batched", "present"]
+__all__ = ["Infos", "Outcome", "Rows", "batched"]
 
 _GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
 _TOLD: Final = {"kpis": "kpi", "proposed": "proposal", "predicted": "prediction"}
 """The kinds of numbers in infos that are written down as they are, by the key of the info."""
-
-
-class Episodes(Protocol):
-    """N environments to read."""
-
-    prototype: FMUEnv
-    count: int
-
-    def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
-        """Evaluate a function of M of the environments; shape (k, M)."""
-
-    @property
-    def pool(self) -> Pool:
-        """Reads variables of the FMUs."""
-
-
-def present(episodes: Episodes, choice: Choice, indices: Any) -> FloatArray:
-    """What environments have at this moment, a row for each: all but what they observe."""
-    return choice.present(episodes.evaluate(choice.read, indices), episodes.pool, indices)
 
 
 class Infos(NamedTuple):
@@ -55,7 +36,7 @@ class Infos(NamedTuple):
 
     of_envs: Mapping[str, Any]
     num_envs: int
-    last: Mapping[str, Any] | None = None
+    last: Mapping[str, Any] = MappingProxyType({})
     ended: Any = False
 
     def names(self, group: str) -> list[str]:
@@ -64,16 +45,13 @@ class Infos(NamedTuple):
 
     def numbers(self, *path: str) -> FloatArray:
         """The numbers at a place in the infos, shape (N,); 0 where there are none."""
-        numbers = _numbers(self.of_envs, path, self.num_envs)
-        if self.last is None:
-            return numbers
-        return np.where(self.ended, _numbers(self.last, path, self.num_envs), numbers)
+        now, last = (_numbers(infos, path, self.num_envs) for infos in (self.of_envs, self.last))
+        return np.where(self.ended, last, now)
 
     def each(self, name: str) -> dict[int, Any]:
         """The values of those environments that have one."""
-        if self.last is None:
-            return _each(self.of_envs, name)
-        now = {i: one for i, one in _each(self.of_envs, name).items() if not self.ended[i]}
+        ended = np.flatnonzero(self.ended)
+        now = {i: one for i, one in _each(self.of_envs, name).items() if i not in ended}
         return now | _each(self.last, name)
 
 
@@ -121,7 +99,7 @@ class Outcome(NamedTuple):
         observations: Likewise.
         ended: The environments whose FMU is in the next episode already.
         last: What those had before, a row for each environment that is written down, as
-            ``present`` gives it; None if there are no such environments.
+            ``Choice.present`` gives it; None if there are no such environments.
     """
 
     rewards: FloatArray
@@ -142,7 +120,6 @@ class Rows:
         indices: The environments to write down.
         every: The number of steps from one row to the next. Rewards and costs in a row are the sums
             since the row before.
-        is_vector: Whether rows have the number of the environment.
         infos: Those of the first reset, which tell the terms of rewards and costs.
     """
 
@@ -152,11 +129,10 @@ class Rows:
         choice: Choice,
         indices: npt.NDArray[np.intp],
         every: int,
-        is_vector: bool,
         infos: Infos,
     ) -> None:
         self._episodes, self._choice, self._indices = episodes, choice, indices
-        self._every, self._is_vector = every, is_vector
+        self._every = every
         self._summed = tuple(_summed(infos))
         self._told = tuple((key, name) for key in _TOLD for name in infos.names(key))
         count = episodes.count
@@ -168,7 +144,7 @@ class Rows:
         self._texts = [i for i, one in enumerate(self.columns) if one.kind in TEXT_KINDS]
 
     def _columns(self) -> Iterator[Quantity]:
-        if self._is_vector:
+        if self._episodes.is_vector:
             yield Quantity("environment", "index")
         yield from (Quantity("episode", "index"), Quantity("step", "index"))
         yield Quantity("time", "time", "s")
@@ -218,8 +194,8 @@ class Rows:
 
     def _values(self, observations: Any, infos: Infos) -> FloatArray:
         """What they have, and what they observe; not what a plant has failed to tell."""
-        seen = self._choice.seen(flat(observations, self._episodes.count), self._indices)
-        now = present(self._episodes, self._choice, self._indices)
+        seen = self._choice.seen(observations, self._indices)
+        now = self._choice.present(self._episodes, self._indices)
         values = np.concatenate([now, seen], axis=1)
         for index, missing in infos.each("missing").items():
             for place, quantity in enumerate(self._choice.quantities):
@@ -240,7 +216,7 @@ class Rows:
         spec = env.inside.spec
         passed: Any = (env.inside.warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
-            *([which] if self._is_vector else []),
+            *([which] if self._episodes.is_vector else []),
             *(self._number[which], self._steps[which]),
             *(
                 spec.communication_point(passed, self._starts[which]),

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
-import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -56,11 +55,16 @@ class Block:
     """
 
     values: FloatArray
-    faults: Mapping[int, str] = field(default_factory=dict)
-    texts: Mapping[float, str] = field(default_factory=dict)
+    faults: Mapping[int, str]
+    texts: Mapping[float, str]
 
     def __len__(self) -> int:
         return len(self.values)
+
+    def cells(self, columns: Iterable[Quantity]) -> Iterator[npt.NDArray[Any]]:
+        """The values of each column, see ``cells_of``."""
+        pairs = zip(self.values.T, columns, strict=True)
+        return (cells_of(values, column, self.texts) for values, column in pairs)
 
     @classmethod
     def joined(cls, blocks: Iterable[Block], width: int) -> Block:
@@ -156,16 +160,14 @@ class CsvStore:
         self._path = path
         self._file = path.open("x", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file, lineterminator="\n")
-        self._kinds = [column.kind for column in columns]
+        self._columns = columns
         self._writer.writerow([*map(heading, columns), FAULT])
 
     def add(self, block: Block) -> None:
         """See ``Store``."""
-        for number, row in enumerate(block.values.tolist()):
-            cells = [
-                self._cell(value, kind, block.texts)
-                for value, kind in zip(row, self._kinds, strict=True)
-            ]
+        columns = [cells.tolist() for cells in block.cells(self._columns)]
+        for number, row in enumerate(zip(*columns, strict=True)):
+            cells = ["" if cell != cell else cell for cell in row]  # no NaN
             self._writer.writerow([*cells, block.faults.get(number, "")])
         try:
             self._file.flush()
@@ -174,14 +176,6 @@ class CsvStore:
                 self._file.close()
             error.filename = str(self._path)
             raise
-
-    @staticmethod
-    def _cell(value: float, kind: str, texts: Mapping[float, str]) -> Any:
-        if math.isnan(value):
-            return ""
-        if kind in TEXT_KINDS:
-            return texts[value]
-        return int(value) if kind in WHOLE else value
 
     def close(self) -> None:
         """See ``Store``."""
@@ -216,10 +210,8 @@ class ParquetStore:
     def _write(self) -> None:
         block = Block.joined(self._waiting, len(self._columns))
         self._waiting, self._rows = [], 0
-        arrays = [
-            self._arrow.array(cells_of(values, column, block.texts), from_pandas=False)
-            for values, column in zip(block.values.T, self._columns, strict=True)
-        ]
+        cells = block.cells(self._columns)
+        arrays = [self._arrow.array(values, from_pandas=False) for values in cells]
         faults = [block.faults.get(number) for number in range(len(block))]
         table = [*arrays, self._arrow.array(faults, self._arrow.string())]
         self._writer.write_table(self._arrow.table(table, schema=self._schema))

@@ -24,7 +24,6 @@ class EpisodeSummary:
         seconds: The simulated time.
         reward: The total reward.
         terms: The totals of its terms by name.
-        cost: The total cost; None if the task has none.
         costs: The totals of its parts by name.
         kpis: The KPIs of the task by name.
         end: ``"terminated"``, ``"truncated"``, ``"fault: ..."``, or ``"stopped"`` before the end.
@@ -36,7 +35,6 @@ class EpisodeSummary:
     seconds: float
     reward: float
     terms: Mapping[str, float]
-    cost: float | None
     costs: Mapping[str, float]
     kpis: Mapping[str, float]
     end: str
@@ -83,14 +81,13 @@ def summaries(series: TimeSeries) -> list[EpisodeSummary]:
 
 
 def _summary(key: tuple[int, int], series: TimeSeries) -> EpisodeSummary:
-    costs, times = series.of_kind("cost"), series["time"]
+    times = series["time"]
     return EpisodeSummary(
         *key,
         steps=int(series["step"][-1]),
         seconds=float(times[-1] - times[0]),
         reward=_total(series, "reward"),
         terms=_totals(series, "reward term"),
-        cost=_total(series, "cost") if costs else None,
         costs=_totals(series, "cost term"),
         kpis={one.name.partition(".")[2]: series[one.name][-1] for one in series.of_kind("kpi")},
         end=_end(series),

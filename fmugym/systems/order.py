@@ -36,8 +36,8 @@ class Order:
     initialization: tuple[Evaluation, ...]
     loops: tuple[tuple[Link, ...], ...]
     late: tuple[Link, ...]
-    unsolved: tuple[str, ...] = ()
-    unsolved_at_start: tuple[str, ...] = ()
+    unsolved: tuple[str, ...]
+    unsolved_at_start: tuple[str, ...]
 
 
 def order_of(

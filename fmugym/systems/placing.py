@@ -186,11 +186,15 @@ def _set_columns(boxes: Mapping[str, Box], wires: Sequence[Wire], order: Sequenc
 
 @dataclass
 class _Columns:
-    """The columns: keys of boxes, and indices of the wires that cross a column."""
+    """The columns: keys of boxes, and indices of the wires that cross a column.
+
+    ``paths`` has for each wire that does not lead back what stands for it in each of its columns.
+    """
 
     boxes: Mapping[str, Box]
     wires: Sequence[Wire]
     columns: list[list[str | int]] = field(default_factory=list)
+    paths: dict[int, dict[int, str | int]] = field(default_factory=dict)
 
     def place(self) -> Point:
         """Give all boxes and wires their places, and return the size."""
@@ -199,52 +203,47 @@ class _Columns:
         for key, box in self.boxes.items():
             self.columns[box.column].append(key)
         for number, wire in enumerate(self.wires):
-            columns = self._span(wire)
-            wire.leads_back = columns[0] >= columns[1]
-            for column in range(columns[0] + 1, columns[1]):
-                self.columns[column].append(number)
+            ends = wire.source[0], wire.target[0]
+            first, last = (self.boxes[key].column for key in ends)
+            wire.leads_back = first >= last
+            if not wire.leads_back:
+                crossed = dict.fromkeys(range(first + 1, last), number)
+                self.paths[number] = {first: ends[0], **crossed, last: ends[1]}
+                for column in crossed:
+                    self.columns[column].append(number)
         self._sort()
         heights = self._stack()
         return self._route(heights)
 
-    def _span(self, wire: Wire) -> tuple[int, int]:
-        return self.boxes[wire.source[0]].column, self.boxes[wire.target[0]].column
-
     def _sort(self) -> None:
         for sweep in range(_SWEEPS):
-            backwards = sweep % 2 == 1
-            for column in range(len(self.columns))[:: -1 if backwards else 1]:
-                rank = {item: self._mean(item, column, backwards) for item in self.columns[column]}
+            step = 1 if sweep % 2 else -1
+            for column in range(len(self.columns))[::-step]:
+                rank = {item: self._mean(item, column, step) for item in self.columns[column]}
                 self.columns[column].sort(key=rank.__getitem__)
 
-    def _mean(self, item: str | int, column: int, backwards: bool) -> float:
-        """The mean place of the neighbours on one side, from 0 to 1."""
-        near = column + (1 if backwards else -1)
-        wires = [item] if isinstance(item, int) else self._wires_of(item, backwards)
+    def _mean(self, item: str | int, column: int, step: int) -> float:
+        """The mean place of the neighbours in the next column, from 0 to 1."""
         places = [
-            self._place_of(number, near, backwards)
-            for number in wires
-            if 0 <= near < len(self.columns) and not self.wires[number].leads_back
+            self._place_of(number, column + step)
+            for number, path in self.paths.items()
+            if path.get(column) == item and column + step in path
         ]
         own = self.columns[column].index(item) / len(self.columns[column])
         return sum(places) / len(places) if places else own
 
-    def _wires_of(self, key: str, backwards: bool) -> list[int]:
-        ends = [(wire.source if backwards else wire.target)[0] for wire in self.wires]
-        return [number for number, end in enumerate(ends) if end == key]
-
-    def _place_of(self, number: int, column: int, backwards: bool) -> float:
+    def _place_of(self, number: int, column: int) -> float:
         """Where a wire ends in a column or crosses it, from 0 to 1."""
-        items, wire = self.columns[column], self.wires[number]
-        key, name = wire.target if backwards else wire.source
-        if number in items:
-            return items.index(number) / len(items)
-        if key not in items:
-            return 0.5
-        box = self.boxes[key]
-        names = box.inputs if backwards else box.outputs
-        within = names.index(name) / len(names) if name in names else 0.0
-        return (items.index(key) + within) / len(items)
+        items, wire, item = self.columns[column], self.wires[number], self.paths[number][column]
+        within = 0.0
+        if isinstance(item, str):
+            box = self.boxes[item]
+            is_source = item == wire.source[0]
+            (_, name), names = (
+                (wire.source, box.outputs) if is_source else (wire.target, box.inputs)
+            )
+            within = names.index(name) / len(names)
+        return (items.index(item) + within) / len(items)
 
     def _stack(self) -> list[float]:
         """Set the places of boxes, each column in the middle of the height."""

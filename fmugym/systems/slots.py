@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
@@ -14,7 +14,7 @@ from typing import TypeAlias
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.systems.system_description import PartVariable, SystemDescription
-from fmugym.systems.system_plan import Component, Evaluation, Group, Link
+from fmugym.systems.system_plan import Component, Evaluation, Group
 
 __all__ = ["Layout", "PartLayout", "Route", "array_key"]
 
@@ -101,46 +101,38 @@ class Layout:
     def __init__(
         self,
         description: SystemDescription,
-        inputs: Iterable[Variable] = (),
-        outputs: Iterable[Variable] = (),
+        inputs: Iterable[Variable],
+        outputs: Iterable[Variable],
     ) -> None:
         self.description, self.plan = description, description.plan
         pairs = zip(self.plan.components, description.parts, strict=True)
         self.parts = [PartLayout(component, part) for component, part in pairs]
         self._numbers = {part.component.name: i for i, part in enumerate(self.parts)}
-        self._input_slots: dict[tuple[int, *_Key], int] = {}
-        self._output_slots: dict[tuple[int, *_Key], int] = {}
+        self._input_slots: _Slots = {}
+        self._output_slots: _Slots = {}
         self._fill(inputs, outputs)
         self.routes = self._find_routes()
 
     def _fill(self, inputs: Iterable[Variable], outputs: Iterable[Variable]) -> None:
-        ins: list[tuple[int, Variable]] = [self._target(link) for link in self.plan.links]
+        ins = [self._end(link.target, link.input) for link in self.plan.links]
         ins += [(e.part, e.variable) for v in inputs for e in self.ends_of(v)]
-        outs: list[tuple[int, Variable]] = [self._source(link) for link in self.plan.links]
+        outs = [self._end(link.source, link.output) for link in self.plan.links]
         outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
         own_inputs, own_outputs = _by_part(ins), _by_part(outs)
         for index, part in enumerate(self.parts):
-            part.inputs = list(_different(_wholes(own_inputs[index])))
-            part.outputs = list(_different(_wholes(own_outputs[index])))
             part.first_input, part.first_output = len(self._input_slots), len(self._output_slots)
-            for place, variable in enumerate(part.inputs, part.first_input):
-                self._input_slots[index, *_key(variable)] = place
-            for place, variable in enumerate(part.outputs, part.first_output):
-                self._output_slots[index, *_key(variable)] = place
+            part.inputs = _filled(self._input_slots, index, own_inputs[index])
+            part.outputs = _filled(self._output_slots, index, own_outputs[index])
 
-    def _source(self, link: Link) -> tuple[int, Variable]:
-        part = self._numbers[link.source]
-        return part, self.parts[part].description.variable(link.output)
-
-    def _target(self, link: Link) -> tuple[int, Variable]:
-        part = self._numbers[link.target]
-        return part, self.parts[part].description.variable(link.input)
+    def _end(self, component: str, name: str) -> tuple[int, Variable]:
+        part = self._numbers[component]
+        return part, self.parts[part].description.variable(name)
 
     def _find_routes(self) -> tuple[Route, ...]:
         routes = []
         for number, link in enumerate(self.plan.links):
-            source_part, output = self._source(link)
-            target_part, variable = self._target(link)
+            source_part, output = self._end(link.source, link.output)
+            target_part, variable = self._end(link.target, link.input)
             if not variable.elements:  # an array may have the size 0
                 continue
             source = self._output_slots[source_part, *_key(output.elements[0])]
@@ -184,13 +176,9 @@ class Layout:
 
     def inner_routes(self, group: Group) -> tuple[int, ...]:
         """The routes within a group."""
-        inside = set(self.parts_of(group))
-        found = (index for part in inside for index in self.routes_into(part))
+        inside, into = set(self.parts_of(group)), self._routes_by_target
+        found = (index for part in inside for index in into.get(part, ()))
         return tuple(sorted(i for i in found if self.routes[i].source_part in inside))
-
-    def routes_into(self, part: int) -> Sequence[int]:
-        """The routes that end at a component."""
-        return self._routes_by_target.get(part, [])
 
     @cached_property
     def _routes_by_target(self) -> dict[int, list[int]]:
@@ -211,6 +199,7 @@ class Layout:
 
 
 _Key: TypeAlias = tuple[int, str, int]
+_Slots: TypeAlias = dict[tuple[int, *_Key], int]
 
 
 def _key(variable: Variable) -> _Key:
@@ -223,12 +212,6 @@ def array_key(end: PartVariable) -> tuple[int, int, str]:
     return end.part, end.variable.value_reference, end.variable.kind
 
 
-def _wholes(variables: Iterable[Variable]) -> Iterator[Variable]:
-    """Scalars as they are, and all elements of arrays of which something is there."""
-    for variable in variables:
-        yield from (variable if variable.array is None else variable.array).elements
-
-
 def _by_part(pairs: Iterable[tuple[int, Variable]]) -> defaultdict[int, list[Variable]]:
     """The variables of each component."""
     found = defaultdict(list)
@@ -237,5 +220,13 @@ def _by_part(pairs: Iterable[tuple[int, Variable]]) -> defaultdict[int, list[Var
     return found
 
 
-def _different(variables: Iterable[Variable]) -> Iterator[Variable]:
-    return iter({_key(variable): variable for variable in variables}.values())
+def _filled(slots: _Slots, part: int, used: Iterable[Variable]) -> list[Variable]:
+    """Give a slot to each value of a component that is used, and return these.
+
+    They are scalars as they are, and all elements of arrays of which something is there.
+    """
+    wholes = (one if one.array is None else one.array for one in used)
+    found = {_key(element): element for whole in wholes for element in whole.elements}
+    for key in found:
+        slots[part, *key] = len(slots)
+    return list(found.values())

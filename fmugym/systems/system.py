@@ -50,6 +50,8 @@ class FMUSystem(WiredSystem):
         connections: As given, as ``Connection`` objects.
         loop: How algebraic loops are solved.
         times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
+        links: The connections between components, with gains and offsets between the FMUs' units.
+        connectors: The system's own inputs, outputs and parameters.
 
     Raises:
         ConfigError: If an argument does not fit, a name is unknown, two connections have one

@@ -132,7 +132,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         tolerance=plan.tolerance,
         step_size=plan.step_size,
         fixed_internal_step_size=None,
-        capabilities=_capabilities(plan, parts),
+        capabilities=_capabilities(parts),
         variables=variables,
         derivatives=_derivatives(plan, parts),
         findings=plan.findings,
@@ -152,7 +152,7 @@ def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[st
     }
 
 
-def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabilities:
+def _capabilities(parts: Sequence[ModelDescription]) -> Capabilities:
     """What all components can; a restriction of one restricts the system."""
     flags = [part.capabilities for part in parts]
     able = {
@@ -314,7 +314,6 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         maximum=max(limits),
         start=own.start if change == IDENTITY else _converted_start(own, convert),
         nominal=None if own.nominal is None else own.nominal * abs(first.reading[0]),
-        description=connector.description or own.description,
     )
 
 

@@ -161,14 +161,12 @@ class Connector:
         ends: What it stands for; an output has one end.
         causality: ``"input"``, ``"output"`` or ``"parameter"``.
         unit: None for that of the first end.
-        description: For people.
     """
 
     name: str
     ends: tuple[End, ...]
     causality: str
     unit: str | None = None
-    description: str = ""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from fmugym.retired import without_retired
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
 from fmugym.systems.order import Order, order_of
-from fmugym.systems.system_plan import LOOP_METHODS, MASTERS, Connector, Link, Loop, SystemPlan
+from fmugym.systems.system_plan import LOOP_METHODS, MASTERS, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
 __all__ = ["LOOPS", "SYSTEM", "WiredSystem"]
@@ -153,6 +153,7 @@ class WiredSystem:
             frozenset(self.own_names) | self.units.keys(),
             self.unit_definitions,
         )
+        self.links, self.connectors = tuple(self._wiring.links), tuple(self._wiring.connectors)
         self.units = {one.name: one.unit for one in self.connectors if one.unit is not None}
         if self.loops == "refuse" and self.order.loops:
             raise ConfigError(
@@ -171,12 +172,7 @@ class WiredSystem:
         unable = {n for n, part in parts.items() if not part.capabilities.can_get_and_set_fmu_state}
         if self.master == "jacobi":  # which repeats no steps
             unable = set()
-        return order_of(list(told), self._wiring.links, told, self.loop, unable, old)
-
-    @property
-    def links(self) -> tuple[Link, ...]:
-        """The connections between components, with gains and offsets between the FMUs' units."""
-        return tuple(self._wiring.links)
+        return order_of(list(told), self.links, told, self.loop, unable, old)
 
     def port(self, name: str) -> Port | None:
         """Find the variable that a name stands for; None for a name of the system itself.
@@ -185,11 +181,6 @@ class WiredSystem:
             ConfigError: If there is no such component or variable.
         """
         return self._wiring.port(name)
-
-    @property
-    def connectors(self) -> tuple[Connector, ...]:
-        """The system's own inputs, outputs and parameters."""
-        return tuple(self._wiring.connectors)
 
     @property
     def open_inputs(self) -> tuple[Port, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, TypeAlias
 
 from fmugym.archive.description import Unit
 from fmugym.archive.units import IDENTITY, Conversion, conversion_of_link
@@ -15,6 +15,9 @@ from fmugym.systems.connections import Connection
 from fmugym.systems.system_plan import Connector, End, Link
 
 __all__ = ["Port", "Wiring"]
+
+_DefinedUnit: TypeAlias = tuple[str | None, Mapping[str, Unit]]
+"""A unit, and the definitions of units by which it is meant."""
 
 _SOURCES = ("output", "local", "calculatedParameter")
 
@@ -71,8 +74,8 @@ class Wiring:
     components: Mapping[str, OpenComponent]
     connections: Iterable[Connection]
     units: Mapping[str, str]
-    own_names: frozenset[str] = frozenset()
-    definitions: Mapping[str, Unit] = field(default_factory=dict)
+    own_names: frozenset[str]
+    definitions: Mapping[str, Unit]
     links: list[Link] = field(default_factory=list)
     connectors: list[Connector] = field(default_factory=list)
     _driven: dict[str, Connection] = field(default_factory=dict)
@@ -127,16 +130,14 @@ class Wiring:
 
     def _link(self, connection: Connection, source: Port, target: Port) -> Link:
         _check_kinds(connection, source, target)
-        own, other = source.variable, target.variable
-        units = self._units(source), self._units(target)
-        conversion = _conversion(connection, own.unit, units[0], other.unit, units[1])
-        end = _end(connection, target, conversion)
-        ends = source.component.name, own.name, end.component, end.variable
+        end = _end(connection, target, self._unit(source), self._unit(target))
+        ends = source.component.name, source.variable.name, end.component, end.variable
         return Link(*ends, end.gain, end.offset)
 
-    def _units(self, port: Port) -> Mapping[str, Unit]:
-        """The units that a variable may have; its FMU knows best what it means by a name."""
-        return {**self.definitions, **port.component.fmu.description.units}
+    def _unit(self, port: Port) -> _DefinedUnit:
+        """The unit of a variable; its FMU knows best what it means by a name."""
+        units = port.component.fmu.description.units
+        return port.variable.unit, {**self.definitions, **units}
 
     def _drive(self, target: Port, connection: Connection) -> None:
         """Note what drives an input; there may be only one."""
@@ -164,14 +165,12 @@ class Wiring:
         self._claim(name, causality, connection)
         ends = self._ends.setdefault(name, [])
         first = self._first(ends)
-        own, definitions = self._own_unit(name, first or target)
-        units = self._units(target)
-        conversion = _conversion(connection, own, definitions, target.variable.unit, units)
+        end = _end(connection, target, self._own_unit(name, first or target), self._unit(target))
         if first is None:
-            _check_gain(connection, target, target)
+            _check_gain(connection, target)
         else:
             _check_kinds(connection, first, target)
-        ends.append(_end(connection, target, conversion))
+        ends.append(end)
 
     def _first(self, ends: list[End]) -> Port | None:
         if not ends:
@@ -179,11 +178,12 @@ class Wiring:
         component = self.components[ends[0].component]
         return Port(component, component.variable(ends[0].variable))
 
-    def _own_unit(self, name: str, port: Port) -> tuple[str | None, Mapping[str, Unit]]:
+    def _own_unit(self, name: str, port: Port) -> _DefinedUnit:
         """The unit of a name of the system, by default that of a variable behind it."""
+        unit, known = self._unit(port)
         if name not in self.units:
-            return port.variable.unit, self._units(port)
-        return self.units[name], {**self._units(port), **self.definitions}
+            return unit, known
+        return self.units[name], {**known, **self.definitions}
 
     def _add_output(self, connection: Connection, source: Port) -> None:
         name = connection.target
@@ -194,11 +194,9 @@ class Wiring:
         self._driven[name] = connection
         self._claim(name, "output", connection)
         _require_number(connection, source)
-        own, definitions = self._own_unit(name, source)
-        unit = source.variable.unit
-        conversion = _conversion(connection, unit, self._units(source), own, definitions)
-        _check_gain(connection, source, source)
-        self._ends[name] = [_end(connection, source, conversion)]
+        end = _end(connection, source, self._unit(source), self._own_unit(name, source))
+        _check_gain(connection, source)
+        self._ends[name] = [end]
 
     def _claim(self, name: str, causality: str, connection: Connection) -> None:
         """Let a name of the system mean one thing."""
@@ -247,26 +245,18 @@ def _require_source(source: Port, connection: Connection) -> None:
         )
 
 
-def _end(connection: Connection, port: Port, conversion: Conversion) -> End:
+def _end(connection: Connection, port: Port, own: _DefinedUnit, other: _DefinedUnit) -> End:
+    """A variable, with what becomes of a value from one unit to the other and by the connection."""
+    conversion = IDENTITY
+    if connection.convert_units:
+        try:
+            conversion = conversion_of_link(*own, *other)
+        except ConfigError as error:
+            raise ConfigError(
+                f"{connection}: {error}; give it a gain and convert_units=False"
+            ) from None
     change = Conversion(connection.gain, connection.offset).after(conversion)
     return End(port.component.name, port.variable.name, change.factor, change.offset)
-
-
-def _conversion(
-    connection: Connection,
-    own: str | None,
-    own_units: Mapping[str, Unit],
-    other: str | None,
-    other_units: Mapping[str, Unit],
-) -> Conversion:
-    if not connection.convert_units:
-        return IDENTITY
-    try:
-        return conversion_of_link(own, own_units, other, other_units)
-    except ConfigError as error:
-        raise ConfigError(
-            f"{connection}: {error}; give it a gain and convert_units=False"
-        ) from None
 
 
 def _check_kinds(connection: Connection, source: Port, target: Port) -> None:
@@ -285,10 +275,10 @@ def _check_kinds(connection: Connection, source: Port, target: Port) -> None:
             f"{connection}: {source.name} is of type {source.variable.type} and {target.name} of "
             f"type {target.variable.type}; only equal kinds can be connected, and Integer with Real"
         )
-    _check_gain(connection, source, target)
+    _check_gain(connection, target)
 
 
-def _check_gain(connection: Connection, source: Port, target: Port) -> None:
+def _check_gain(connection: Connection, target: Port) -> None:
     plain = connection.gain == 1 and connection.offset == 0
     if target.kind != "real" and not plain:
         raise ConfigError(

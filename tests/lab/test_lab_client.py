@@ -371,7 +371,7 @@ class TestStartingSessions:
             ({"length": float("nan")}, "nan is outside the limits"),
             ({"initial_position": [7.0]}, "initial_position 7.0 is outside the limits"),
             ({"initial_position": [0.1, 0.2]}, "initial_position has 2 entries, .* 1 joints"),
-            ({"initial_position": ["up"]}, "must be a number for each joint"),
+            ({"initial_position": ["up"]}, "each entry.*must be a number"),
             ({"preparation_time": -1.0}, "preparation_time -1.0 is outside the limits"),
             ({"disturbances": "earthquake"}, "unknown disturbance preset 'earthquake'"),
             ({"kind": "SimplePendlum"}, "did you mean 'SimplePendulum'"),

@@ -15,6 +15,8 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, write_report
 from fmugym.series.plots import as_svg
+from fmugym.series.rows import Infos
+from fmugym.task.quantity import Quantity
 from fmugym.vector import FMUVectorEnv
 
 TASK = {
@@ -309,6 +311,18 @@ class TestFiles:
         assert (tmp_path / "b.csv").read_text() == (tmp_path / "a.csv").read_text()
         with pytest.raises(FileExistsError):
             env.series.write(tmp_path / "a.csv")
+
+    def test_faults_of_ended_episodes_are_in_their_last_infos(self):
+        now = {"fault": ["of the next", "own"], "_fault": np.array([True, True])}
+        last = {"fault": ["at the end", ""], "_fault": np.array([True, False])}
+        infos = Infos(now, 2, last, np.array([True, False]))
+        assert infos.each("fault") == {0: "at the end", 1: "own"}
+
+    def test_a_cell_without_a_number_is_empty(self, tmp_path):
+        columns = Quantity("step", "index"), Quantity("angle", "output", "rad")
+        series = TimeSeries(columns, np.array([[0.0, np.nan], [1.0, 0.5]]), {1: "broken"})
+        series.write(tmp_path / "a.csv")
+        assert (tmp_path / "a.csv").read_text() == "step,angle [rad],fault\n0,,\n1,0.5,broken\n"
 
     @pytest.mark.parametrize("suffix", ["csv", "parquet"])
     def test_nothing_is_lost_when_an_exception_stops_the_run(self, suffix, tmp_path):

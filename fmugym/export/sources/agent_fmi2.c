@@ -2,12 +2,16 @@
 
 #include "fmi2Functions.h"
 
+#define FMI(name) fmi2##name
+#define OF_STATE(verb, noun) fmi2##verb##FMUstate##noun
+#define DESERIALIZE fmi2DeSerializeFMUstate
+#define AND_LENGTH
+#define FITS true
+
 #include "fmu_instance.h"
 
-#define OR_ERROR(done) ((done) ? fmi2OK : fmi2Error)
-
 static void emit(const void *instance, const char *message) {
-    const Controller *controller = (const Controller *)instance;
+    const Controller *controller = instance;
     fmi2CallbackLogger logger;
     memcpy(&logger, &controller->logger, sizeof logger); /* ISO C has no cast between the two */
     logger(controller->environment, controller->name, fmi2Error, "logStatusError", message);
@@ -37,10 +41,6 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, 
     return controller;
 }
 
-void fmi2FreeInstance(fmi2Component c) {
-    destroy((Controller *)c);
-}
-
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance,
                                fmi2Real start, fmi2Boolean has_stop, fmi2Real stop) {
     Memory *memory = &((Controller *)c)->memory;
@@ -53,88 +53,15 @@ fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
     return fmi2OK;
 }
 
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
-    return OR_ERROR(end_initialization((Controller *)c));
-}
+ACCESS(Real, 'd')
+ACCESS(Integer, 'i')
+ACCESS(Boolean, '?')
 
-fmi2Status fmi2Terminate(fmi2Component c) {
-    ((Controller *)c)->memory.mode = TERMINATED;
-    return fmi2OK;
-}
-
-fmi2Status fmi2Reset(fmi2Component c) {
-    begin((Controller *)c);
-    return fmi2OK;
-}
-
-#define ACCESS(Type, kind, converted)                                                              \
-    fmi2Status fmi2Get##Type(fmi2Component c, const fmi2ValueReference references[], size_t n,     \
-                             fmi2##Type values[]) {                                                \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            double value = 0.0;                                                                    \
-            if (!get_value((Controller *)c, references[i], kind, &value)) {                        \
-                return fmi2Error;                                                                  \
-            }                                                                                      \
-            values[i] = (fmi2##Type)(converted);                                                   \
-        }                                                                                          \
-        return fmi2OK;                                                                             \
-    }                                                                                              \
-    fmi2Status fmi2Set##Type(fmi2Component c, const fmi2ValueReference references[], size_t n,     \
-                             const fmi2##Type values[]) {                                          \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            if (!set_value((Controller *)c, references[i], kind, (double)values[i])) {             \
-                return fmi2Error;                                                                  \
-            }                                                                                      \
-        }                                                                                          \
-        return fmi2OK;                                                                             \
-    }
-
-ACCESS(Real, 'd', value)
-ACCESS(Integer, 'i', value)
-ACCESS(Boolean, '?', value != 0.0)
-
-fmi2Status fmi2GetString(fmi2Component c, const fmi2ValueReference references[], size_t n,
-                         fmi2String values[]) {
-    return OR_ERROR(n == 0);
-}
-
-fmi2Status fmi2SetString(fmi2Component c, const fmi2ValueReference references[], size_t n,
-                         const fmi2String values[]) {
-    return OR_ERROR(n == 0);
-}
-
-fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    return OR_ERROR(remember((Controller *)c, state));
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
-    return OR_ERROR(recall((Controller *)c, state));
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
-    free(*state);
-    *state = NULL;
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
-    *size = sizeof(Memory);
-    return fmi2OK;
-}
-
-fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[],
-                                 size_t size) {
-    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
-}
-
-fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size,
-                                   fmi2FMUstate *state) {
-    *state = NULL;
-    if (!remember((Controller *)c, state)) {
-        return fmi2Error;
-    }
-    return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));
-}
+/* Functions of types that no variable has, and of derivatives. */
+OF_NONE(GetString, fmi2String values[])
+OF_NONE(SetString, const fmi2String values[])
+OF_NONE(SetRealInputDerivatives, const fmi2Integer orders[], const fmi2Real values[])
+OF_NONE(GetRealOutputDerivatives, const fmi2Integer orders[], fmi2Real values[])
 
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[],
                                         size_t n, const fmi2ValueReference knowns[], size_t m,
@@ -142,19 +69,8 @@ fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReferenc
     return fmi2Error;
 }
 
-fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference references[],
-                                       size_t n, const fmi2Integer orders[],
-                                       const fmi2Real values[]) {
-    return OR_ERROR(n == 0);
-}
-
-fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReference references[],
-                                        size_t n, const fmi2Integer orders[], fmi2Real values[]) {
-    return OR_ERROR(n == 0);
-}
-
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real size, fmi2Boolean no_set_state) {
-    return OR_ERROR(step((Controller *)c, time, size));
+    return OR_ERROR(step(c, time, size));
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c) {

@@ -2,12 +2,16 @@
 
 #include "fmi3Functions.h"
 
+#define FMI(name) fmi3##name
+#define OF_STATE(verb, noun) fmi3##verb##FMUState##noun
+#define DESERIALIZE fmi3DeserializeFMUState
+#define AND_LENGTH , size_t length
+#define FITS (n == length)
+
 #include "fmu_instance.h"
 
-#define OR_ERROR(done) ((done) ? fmi3OK : fmi3Error)
-
 static void emit(const void *instance, const char *message) {
-    const Controller *controller = (const Controller *)instance;
+    const Controller *controller = instance;
     fmi3LogMessageCallback log_message;
     memcpy(&log_message, &controller->logger, sizeof log_message); /* C has no cast between them */
     log_message(controller->environment, fmi3Error, "logStatusError", message);
@@ -54,10 +58,6 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
     return NULL;
 }
 
-void fmi3FreeInstance(fmi3Instance c) {
-    destroy((Controller *)c);
-}
-
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance,
                                        fmi3Float64 tolerance, fmi3Float64 start,
                                        fmi3Boolean has_stop, fmi3Float64 stop) {
@@ -66,43 +66,6 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance
     memory->mode = INITIALIZATION;
     return fmi3OK;
 }
-
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) {
-    return OR_ERROR(end_initialization((Controller *)c));
-}
-
-fmi3Status fmi3Terminate(fmi3Instance c) {
-    ((Controller *)c)->memory.mode = TERMINATED;
-    return fmi3OK;
-}
-
-fmi3Status fmi3Reset(fmi3Instance c) {
-    begin((Controller *)c);
-    return fmi3OK;
-}
-
-#define ACCESS(Type, kind)                                                                         \
-    fmi3Status fmi3Get##Type(fmi3Instance c, const fmi3ValueReference references[], size_t n,      \
-                             fmi3##Type values[], size_t n_values) {                               \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            double value = 0.0;                                                                    \
-            if (n != n_values || !get_value((Controller *)c, references[i], kind, &value)) {       \
-                return fmi3Error;                                                                  \
-            }                                                                                      \
-            values[i] = (fmi3##Type)value;                                                         \
-        }                                                                                          \
-        return fmi3OK;                                                                             \
-    }                                                                                              \
-    fmi3Status fmi3Set##Type(fmi3Instance c, const fmi3ValueReference references[], size_t n,      \
-                             const fmi3##Type values[], size_t n_values) {                         \
-        for (size_t i = 0; i < n; i++) {                                                           \
-            if (n != n_values ||                                                                   \
-                !set_value((Controller *)c, references[i], kind, (double)values[i])) {             \
-                return fmi3Error;                                                                  \
-            }                                                                                      \
-        }                                                                                          \
-        return fmi3OK;                                                                             \
-    }
 
 ACCESS(Float32, 'f')
 ACCESS(Float64, 'd')
@@ -116,239 +79,75 @@ ACCESS(Int64, 'q')
 ACCESS(UInt64, 'Q')
 ACCESS(Boolean, '?')
 
-fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
-    return OR_ERROR(remember((Controller *)c, state));
-}
-
-fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
-    return OR_ERROR(recall((Controller *)c, state));
-}
-
-fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
-    free(*state);
-    *state = NULL;
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) {
-    *size = sizeof(Memory);
-    return fmi3OK;
-}
-
-fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[],
-                                 size_t size) {
-    return OR_ERROR(copy_bytes((Controller *)c, bytes, state, size));
-}
-
-fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size,
-                                   fmi3FMUState *state) {
-    *state = NULL;
-    if (!remember((Controller *)c, state)) {
-        return fmi3Error;
-    }
-    return OR_ERROR(copy_bytes((Controller *)c, *state, bytes, size));
-}
-
 fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 size, fmi3Boolean no_set_state,
                       fmi3Boolean *needs_events, fmi3Boolean *terminates, fmi3Boolean *is_early,
                       fmi3Float64 *last_time) {
-    const bool done = step((Controller *)c, time, size);
+    const bool done = step(c, time, size);
     *needs_events = *terminates = *is_early = false;
     *last_time = ((Controller *)c)->memory.time;
     return OR_ERROR(done);
 }
 
-/* What a controller does not have */
+/* What a controller does not have: functions that fail, and those of values that it has none of. */
 
-fmi3Status fmi3EnterEventMode(fmi3Instance c) {
-    return fmi3Error;
-}
+#define LACKING(name, ...)                                                                         \
+    fmi3Status name(__VA_ARGS__) {                                                                 \
+        return fmi3Error;                                                                          \
+    }
 
-fmi3Status fmi3GetString(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, fmi3String values[], size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, size_t valueSizes[], fmi3Binary values[],
-                         size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                        size_t nValueReferences, fmi3Clock values[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetString(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, const fmi3String values[], size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetBinary(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                         size_t nValueReferences, const size_t valueSizes[],
-                         const fmi3Binary values[], size_t nValues) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetClock(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                        size_t nValueReferences, const fmi3Clock values[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetNumberOfVariableDependencies(fmi3Instance c, fmi3ValueReference valueReference,
-                                               size_t *nDependencies) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference dependent,
-                                       size_t elementIndicesOfDependent[],
-                                       fmi3ValueReference independents[],
-                                       size_t elementIndicesOfIndependents[],
-                                       fmi3DependencyKind dependencyKinds[],
-                                       size_t nDependencies) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
-                                        size_t nUnknowns, const fmi3ValueReference knowns[],
-                                        size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                        fmi3Float64 sensitivity[], size_t nSensitivity) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, const fmi3ValueReference unknowns[],
-                                    size_t nUnknowns, const fmi3ValueReference knowns[],
-                                    size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
-                                    fmi3Float64 sensitivity[], size_t nSensitivity) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                  size_t nValueReferences, fmi3Float64 intervals[],
-                                  fmi3IntervalQualifier qualifiers[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                   size_t nValueReferences, fmi3UInt64 counters[],
-                                   fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                               size_t nValueReferences, fmi3Float64 shifts[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3GetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                size_t nValueReferences, fmi3UInt64 counters[],
-                                fmi3UInt64 resolutions[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetIntervalDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                  size_t nValueReferences, const fmi3Float64 intervals[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetIntervalFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                   size_t nValueReferences, const fmi3UInt64 counters[],
-                                   const fmi3UInt64 resolutions[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetShiftDecimal(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                               size_t nValueReferences, const fmi3Float64 shifts[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3SetShiftFraction(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                size_t nValueReferences, const fmi3UInt64 counters[],
-                                const fmi3UInt64 resolutions[]) {
-    return OR_ERROR(nValueReferences == 0);
-}
-
-fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *discreteStatesNeedUpdate,
-                                    fmi3Boolean *terminateSimulation,
-                                    fmi3Boolean *nominalsOfContinuousStatesChanged,
-                                    fmi3Boolean *valuesOfContinuousStatesChanged,
-                                    fmi3Boolean *nextEventTimeDefined,
-                                    fmi3Float64 *nextEventTime) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c,
-                                       fmi3Boolean noSetFMUStatePriorToCurrentPoint,
-                                       fmi3Boolean *enterEventMode,
-                                       fmi3Boolean *terminateSimulation) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 continuousStates[],
-                                   size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 derivatives[],
-                                             size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 eventIndicators[],
-                                  size_t nEventIndicators) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 continuousStates[],
-                                   size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominals[],
-                                             size_t nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *nEventIndicators) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *nContinuousStates) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3EnterStepMode(fmi3Instance c) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference valueReferences[],
-                                    size_t nValueReferences, const fmi3Int32 orders[],
-                                    fmi3Float64 values[], size_t nValues) {
-    return fmi3Error;
-}
-
-fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference clockReference,
-                                      fmi3Float64 activationTime) {
-    return fmi3Error;
-}
+LACKING(fmi3EnterEventMode, fmi3Instance c)
+OF_NONE(GetString, fmi3String values[], size_t nValues)
+OF_NONE(GetBinary, size_t valueSizes[], fmi3Binary values[], size_t nValues)
+OF_NONE(GetClock, fmi3Clock values[])
+OF_NONE(SetString, const fmi3String values[], size_t nValues)
+OF_NONE(SetBinary, const size_t valueSizes[], const fmi3Binary values[], size_t nValues)
+OF_NONE(SetClock, const fmi3Clock values[])
+LACKING(fmi3GetNumberOfVariableDependencies, fmi3Instance c, fmi3ValueReference valueReference,
+        size_t *nDependencies)
+LACKING(fmi3GetVariableDependencies, fmi3Instance c, fmi3ValueReference dependent,
+        size_t elementIndicesOfDependent[], fmi3ValueReference independents[],
+        size_t elementIndicesOfIndependents[], fmi3DependencyKind dependencyKinds[],
+        size_t nDependencies)
+LACKING(fmi3GetDirectionalDerivative, fmi3Instance c, const fmi3ValueReference unknowns[],
+        size_t nUnknowns, const fmi3ValueReference knowns[], size_t nKnowns,
+        const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[], size_t nSensitivity)
+LACKING(fmi3GetAdjointDerivative, fmi3Instance c, const fmi3ValueReference unknowns[],
+        size_t nUnknowns, const fmi3ValueReference knowns[], size_t nKnowns,
+        const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[], size_t nSensitivity)
+LACKING(fmi3EnterConfigurationMode, fmi3Instance c)
+LACKING(fmi3ExitConfigurationMode, fmi3Instance c)
+OF_NONE(GetIntervalDecimal, fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
+OF_NONE(GetIntervalFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[],
+        fmi3IntervalQualifier qualifiers[])
+OF_NONE(GetShiftDecimal, fmi3Float64 shifts[])
+OF_NONE(GetShiftFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[])
+OF_NONE(SetIntervalDecimal, const fmi3Float64 intervals[])
+OF_NONE(SetIntervalFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+OF_NONE(SetShiftDecimal, const fmi3Float64 shifts[])
+OF_NONE(SetShiftFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+LACKING(fmi3EvaluateDiscreteStates, fmi3Instance c)
+LACKING(fmi3UpdateDiscreteStates, fmi3Instance c, fmi3Boolean *discreteStatesNeedUpdate,
+        fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,
+        fmi3Boolean *valuesOfContinuousStatesChanged, fmi3Boolean *nextEventTimeDefined,
+        fmi3Float64 *nextEventTime)
+LACKING(fmi3EnterContinuousTimeMode, fmi3Instance c)
+LACKING(fmi3CompletedIntegratorStep, fmi3Instance c, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+        fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation)
+LACKING(fmi3SetTime, fmi3Instance c, fmi3Float64 time)
+LACKING(fmi3SetContinuousStates, fmi3Instance c, const fmi3Float64 continuousStates[],
+        size_t nContinuousStates)
+LACKING(fmi3GetContinuousStateDerivatives, fmi3Instance c, fmi3Float64 derivatives[],
+        size_t nContinuousStates)
+LACKING(fmi3GetEventIndicators, fmi3Instance c, fmi3Float64 eventIndicators[],
+        size_t nEventIndicators)
+LACKING(fmi3GetContinuousStates, fmi3Instance c, fmi3Float64 continuousStates[],
+        size_t nContinuousStates)
+LACKING(fmi3GetNominalsOfContinuousStates, fmi3Instance c, fmi3Float64 nominals[],
+        size_t nContinuousStates)
+LACKING(fmi3GetNumberOfEventIndicators, fmi3Instance c, size_t *nEventIndicators)
+LACKING(fmi3GetNumberOfContinuousStates, fmi3Instance c, size_t *nContinuousStates)
+LACKING(fmi3EnterStepMode, fmi3Instance c)
+LACKING(fmi3GetOutputDerivatives, fmi3Instance c, const fmi3ValueReference valueReferences[],
+        size_t nValueReferences, const fmi3Int32 orders[], fmi3Float64 values[], size_t nValues)
+LACKING(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clockReference,
+        fmi3Float64 activationTime)

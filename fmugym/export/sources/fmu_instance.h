@@ -58,12 +58,12 @@ static Controller *create(const char *name, const char *token) {
     if (token == NULL || strcmp(token, TOKEN) != 0) {
         return NULL;
     }
-    Controller *controller = (Controller *)calloc(1, sizeof *controller);
+    Controller *controller = calloc(1, sizeof *controller);
     if (controller == NULL) {
         return NULL;
     }
     name = name == NULL ? "" : name;
-    controller->name = (char *)malloc(strlen(name) + 1);
+    controller->name = malloc(strlen(name) + 1);
     if (controller->name == NULL) {
         free(controller);
         return NULL;
@@ -203,6 +203,88 @@ static bool copy_bytes(const Controller *controller, void *to, const void *from,
     }
     memcpy(to, from, size);
     return true;
+}
+
+/* The functions that are the same in FMI 2.0 and 3.0. Whoever includes this tells how their names
+ * begin and are written, and whether arrays of values tell their length. */
+
+#define OR_ERROR(done) ((done) ? FMI(OK) : FMI(Error))
+
+/* The functions that get and set the variables of a type. */
+#define ACCESS(Type, kind)                                                                         \
+    FMI(Status) FMI(Get##Type)(void *c, const FMI(ValueReference) references[], size_t n,          \
+                               FMI(Type) values[] AND_LENGTH) {                                    \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            double value = 0.0;                                                                    \
+            if (!FITS || !get_value(c, references[i], kind, &value)) {                             \
+                return FMI(Error);                                                                 \
+            }                                                                                      \
+            values[i] = (FMI(Type))(kind == '?' ? value != 0.0 : value);                           \
+        }                                                                                          \
+        return FMI(OK);                                                                            \
+    }                                                                                              \
+    FMI(Status) FMI(Set##Type)(void *c, const FMI(ValueReference) references[], size_t n,          \
+                               const FMI(Type) values[] AND_LENGTH) {                              \
+        for (size_t i = 0; i < n; i++) {                                                           \
+            if (!FITS || !set_value(c, references[i], kind, (double)values[i])) {                  \
+                return FMI(Error);                                                                 \
+            }                                                                                      \
+        }                                                                                          \
+        return FMI(OK);                                                                            \
+    }
+
+/* A function of values of a kind that no variable has. */
+#define OF_NONE(name, ...)                                                                         \
+    FMI(Status) FMI(name)(void *c, const FMI(ValueReference) references[], size_t n,               \
+                          __VA_ARGS__) {                                                           \
+        return OR_ERROR(n == 0);                                                                   \
+    }
+
+void FMI(FreeInstance)(void *c) {
+    destroy(c);
+}
+
+FMI(Status) FMI(ExitInitializationMode)(void *c) {
+    return OR_ERROR(end_initialization(c));
+}
+
+FMI(Status) FMI(Terminate)(void *c) {
+    ((Controller *)c)->memory.mode = TERMINATED;
+    return FMI(OK);
+}
+
+FMI(Status) FMI(Reset)(void *c) {
+    begin(c);
+    return FMI(OK);
+}
+
+FMI(Status) OF_STATE(Get, )(void *c, void **state) {
+    return OR_ERROR(remember(c, state));
+}
+
+FMI(Status) OF_STATE(Set, )(void *c, void *state) {
+    return OR_ERROR(recall(c, state));
+}
+
+FMI(Status) OF_STATE(Free, )(void *c, void **state) {
+    free(*state);
+    *state = NULL;
+    return FMI(OK);
+}
+
+FMI(Status) OF_STATE(Serialized, Size)(void *c, void *state, size_t *size) {
+    *size = sizeof(Memory);
+    return FMI(OK);
+}
+
+FMI(Status) OF_STATE(Serialize, )(void *c, void *state, FMI(Byte) bytes[], size_t size) {
+    return OR_ERROR(copy_bytes(c, bytes, state, size));
+}
+
+FMI(Status) DESERIALIZE(void *c, const FMI(Byte) bytes[], size_t size, void **state) {
+    *state = NULL;
+    const bool has_memory = remember(c, state);
+    return OR_ERROR(has_memory && copy_bytes(c, *state, bytes, size));
 }
 
 #endif

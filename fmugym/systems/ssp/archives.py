@@ -37,9 +37,7 @@ _extracted: Final[dict[tuple[Path, int, int], Path]] = {}
 """Folders of the FMUs of archives by path, time and size. They are removed with the process."""
 
 
-def arguments_of(
-    path: str | os.PathLike[str], limits: ArchiveLimits | None = None
-) -> dict[str, Any]:
+def arguments_of(path: str | os.PathLike[str], limits: ArchiveLimits | None) -> dict[str, Any]:
     """Read an SSP archive as the arguments of an ``FMUSystem``. Nothing of its FMUs is executed.
 
     Nested systems become one level: a component ``plant`` of the system ``car`` is named
@@ -48,7 +46,7 @@ def arguments_of(
 
     Args:
         path: The ``.ssp`` file.
-        limits: What is too large to be opened.
+        limits: What is too large to be opened; None for the default.
 
     Raises:
         ConfigError: If a connection has a mistake.
@@ -60,7 +58,8 @@ def arguments_of(
         raise FMULoadError(f"there is no system at {file}")
     if not zipfile.is_zipfile(file):
         raise FMULoadError(f"{file.name} is no SSP archive: it is no zip archive")
-    reader = _Reader(SafeZip(file, limits or ArchiveLimits()), limits or ArchiveLimits())
+    limits = limits or ArchiveLimits()
+    reader = _Reader(SafeZip(file, limits), limits)
     try:
         return reader.arguments()
     except FMUGymError as error:

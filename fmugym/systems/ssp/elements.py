@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 from fmugym.archive.description import BASE_UNITS, Unit
@@ -93,9 +93,9 @@ class Element:
     name: str
     connectors: dict[str, OwnConnector]
     bindings: list[Any]
-    source: str = ""
-    interface: str | None = None
-    own: dict[str, str] = field(default_factory=dict)
+    source: str
+    interface: str | None
+    own: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class SystemElement:
     elements: dict[str, Element | SystemElement]
     wires: list[Wire]
     own: dict[str, str]
-    description: str = ""
+    description: str
 
 
 def children(xml: Any, path: str) -> Iterator[Any]:
