@@ -106,9 +106,9 @@ class BackendPool(CountedPool):
 
     def prepare_play(self, *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""
-        from fmugym.pool.around import PlayAround
+        from fmugym.pool.around import play_around
 
-        return PlayAround(self, self._spec).prepare(*parts)
+        return play_around(self, self._spec, *parts)
 
     @property
     def is_real(self) -> bool:

@@ -260,11 +260,11 @@ class ProcessPool(AskingPool):
 
     def prepare_play(self, *parts: Any) -> Play:
         """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""
-        from fmugym.pool.around import PlayAround
+        from fmugym.pool.around import play_around
 
         self._plays += 1
         self._parts, self._play = parts, None
-        return PlayAround(self, self._spec).prepare(*parts)
+        return play_around(self, self._spec, *parts)
 
     @property
     def rolls_out(self) -> bool:
