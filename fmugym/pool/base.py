@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.errors import SimulationError, first_of
+from fmugym.errors import SimulationError
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
@@ -26,7 +26,6 @@ __all__ = [
     "PoolSpec",
     "StatusArray",
     "available_processors",
-    "naming",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -278,9 +277,3 @@ class Pool(ABC):
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """Return facts about the last step by name, each of shape (N,)."""
         return {}
-
-
-def naming(failure: str, variables: tuple[Variable, ...]) -> str:
-    """The words of a failure to read variables, with their names."""
-    names = first_of([variable.name for variable in variables])
-    return failure.replace("reading variables", f"reading {names}", 1)
