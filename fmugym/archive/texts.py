@@ -23,7 +23,6 @@ __all__ = [
     "ask_for_texts",
     "number_of",
     "numbers_of",
-    "text_among",
     "text_of",
     "texts_of",
     "with_texts",
@@ -99,11 +98,6 @@ def ask_for_texts(find: Callable[[float], str | None], owner: object | None = No
 
     _finders[find_if_alive] = None
     weakref.finalize(owner, _finders.pop, find_if_alive, None)
-
-
-def text_among(variable: Variable, number: float) -> str:
-    """The text of a String that a number stands for; see ``with_texts``."""
-    return next(text for text, own in variable.items if own == number)
 
 
 def numbers_of(texts: Iterable[str | None]) -> npt.NDArray[np.float64]:

@@ -36,7 +36,7 @@ from fmugym.pool.base import (
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
-from fmugym.pool.health import no_counts
+from fmugym.pool.health import new_arrays
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.reports import Receiver, loading_failed
@@ -103,13 +103,8 @@ class NativePool(AskingPool):
         if private_libraries is None:
             once = capabilities.can_be_instantiated_only_once_per_process
             private_libraries = once and num_instances > 1
-        self.num_instances = num_instances
+        self._use(new_arrays(spec, num_instances))
         self.threads = available_processors() if threads is None else max(1, threads)
-        self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))
-        self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
-        self.statuses: StatusArray = np.zeros(num_instances, np.int8)
-        self.observations: FloatArray32 = np.zeros((num_instances, spec.num_observed), np.float32)
-        self._counts = no_counts(num_instances)
         self._result = self.outputs, self.statuses
         self._fmu, self._spec = fmu, spec
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.texts import text_among
+from fmugym.archive.texts import text_of
 from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
@@ -24,7 +24,7 @@ from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.pool.health import Column, CountedPool, no_counts, note
+from fmugym.pool.health import Column, CountedPool, new_arrays, note
 from fmugym.pool.spec import is_start_time
 from fmugym.signals import ordinary
 
@@ -62,16 +62,10 @@ class BackendPool(CountedPool):
         self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any, *, is_real: bool = True
     ) -> None:
         if spec.samplings and not getattr(backend, "samples_outputs", False):
-            fmu.close()
             raise ConfigError("a backend has no substeps: leave 'samplings' out of the config")
-        self.num_instances = num_instances
+        self._use(new_arrays(spec, num_instances))
         self._spec, self._is_real = spec, is_real
-        self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))
-        self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
-        self.statuses: StatusArray = np.zeros(num_instances, np.int8)
-        self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._failures = [""] * num_instances
-        self._counts = no_counts(num_instances)
         self._is_ready = np.zeros(num_instances, np.bool_)
         self._ages: FloatArray = np.zeros(num_instances)
         self._paced = backend if isinstance(backend, Paced) else None
@@ -320,7 +314,7 @@ def _backends(backend: Any, count: int) -> list[Backend]:
 def _by_name(variables: Sequence[Variable], values: Sequence[float]) -> dict[str, float | str]:
     """Start values by name; those of Strings as texts."""
     return {
-        variable.name: text_among(variable, value) if variable.kind == "string" else value
+        variable.name: text_of(value) if variable.kind == "string" else value
         for variable, value in zip(variables, values, strict=True)
     }
 

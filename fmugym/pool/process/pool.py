@@ -79,6 +79,7 @@ class ProcessPool(AskingPool):
             written; only with glibc.
         on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
             this process, and the random numbers of the C library differ from worker to worker.
+        make_group: What makes the workers, of the same arguments as a ``WorkerGroup``.
 
     Attributes:
         workers: How many processes there are.
@@ -104,8 +105,8 @@ class ProcessPool(AskingPool):
         closing_time: float | None = None,
         checks_heap: bool = False,
         on_trial: bool = False,
+        make_group: Callable[..., WorkerGroup] = WorkerGroup,
     ) -> None:
-        self.num_instances = num_instances
         self._spec = spec
         self._lock = RLock()
         self._play: PlayOfWorkers | None
@@ -130,19 +131,14 @@ class ProcessPool(AskingPool):
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
-        arrays = memory.arrays
-        self.inputs, self.outputs = arrays.inputs, arrays.outputs
-        self.observations, self.statuses = arrays.observations, arrays.statuses
-        self._mask, self._counts = arrays.mask, arrays.counts
-        self._arrays, self._plays, self._play = arrays, 0, None
+        self._use(memory.arrays)
+        self._mask = memory.arrays.mask
+        self._arrays, self._plays, self._play = memory.arrays, 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._group = self._grouped(fmu, setups, memory, log, timeout, closing_time)
+        self._group = make_group(fmu, setups, memory, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._group)
-
-    def _grouped(self, *arguments: Any) -> WorkerGroup:
-        return WorkerGroup(*arguments)
 
     # The contract of Pool.
 
