@@ -105,9 +105,9 @@ def _open(plan: Plan, log: logging.Logger) -> SavingPool:
         with progress(log, f"{fmu.path.name}: the instantiation of {count} instance(s)"):
             pool = _pool(plan, log)
     except BaseException:
-        claim.release()
+        claim.close()
         raise
-    pool.hold(claim.release)
+    pool.hold(claim.close)
     pool.save_by(plan.save_by)
     return pool
 
