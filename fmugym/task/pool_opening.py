@@ -170,7 +170,6 @@ class PoolOpening:
         """
         most = self.config.foreign.max_instances
         if most is not None and num_instances > most:
-            self.fmu.close()
             raise ConfigError(
                 f"{self.fmu.path.name}: {num_instances} environments need {num_instances} "
                 f"instances, but 'max_instances' of 'foreign' allows {most}"
