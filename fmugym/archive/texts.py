@@ -25,6 +25,7 @@ __all__ = [
     "numbers_of",
     "text_of",
     "texts_of",
+    "values_by_name",
     "with_texts",
 ]
 
@@ -98,6 +99,16 @@ def ask_for_texts(find: Callable[[float], str | None], owner: object | None = No
 
     _finders[find_if_alive] = None
     weakref.finalize(owner, _finders.pop, find_if_alive, None)
+
+
+def values_by_name(
+    variables: Iterable[Variable], numbers: Iterable[float]
+) -> dict[str, float | str]:
+    """The values of variables by name, those of Strings as texts."""
+    return {
+        variable.name: text_of(number) if variable.kind == "string" else number
+        for variable, number in zip(variables, numbers, strict=True)
+    }
 
 
 def numbers_of(texts: Iterable[str | None]) -> npt.NDArray[np.float64]:

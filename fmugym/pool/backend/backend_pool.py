@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.texts import text_of
+from fmugym.archive.texts import values_by_name
 from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
@@ -121,7 +121,7 @@ class BackendPool(CountedPool):
         values = values[given]
         own = [v for v, is_given in zip(variables, given, strict=True) if is_given]
         starts = {
-            index: _by_name(own, values[:, index].tolist())
+            index: values_by_name(own, values[:, index].tolist())
             for index in np.flatnonzero(chosen).tolist()
         }
         with self._halted_by_errors():
@@ -309,14 +309,6 @@ def _backends(backend: Any, count: int) -> list[Backend]:
             "their number that returns one"
         )
     return backends
-
-
-def _by_name(variables: Sequence[Variable], values: Sequence[float]) -> dict[str, float | str]:
-    """Start values by name; those of Strings as texts."""
-    return {
-        variable.name: text_of(value) if variable.kind == "string" else value
-        for variable, value in zip(variables, values, strict=True)
-    }
 
 
 def _stop(
