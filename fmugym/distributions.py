@@ -276,10 +276,7 @@ class Truncated:
 
 
 _KINDS: Final[Mapping[str, type[Any]]] = {
-    "uniform": Uniform,
-    "log_uniform": LogUniform,
-    "normal": Normal,
-    "choice": Choice,
+    kind.distribution: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
 _OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), Column)
 _LARGEST: Final = float(np.finfo(np.float64).max)

@@ -195,10 +195,7 @@ def _other_start(env: FMUEnv, actions: list[Any], seed: int) -> _Start:
     """Another seed and, if the FMU runs with them, parameters that differ by one percent."""
     with _fresh(env) as tried:
         tried.reset(seed=seed)
-        given = {
-            n: v for n, v in tried.parameters.items() if n not in tried.inside.interface.input_names
-        }
-        changed = {name: _changed(tried, name, value) for name, value in given.items()}
+        changed = {n: _changed(tried, n, value) for n, value in tried.parameters.items()}
         start = _Start(
             seed + 1, {name: value for name, value in changed.items() if value is not None}
         )
@@ -257,9 +254,7 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
                 raise ContractError(f"parameter {name!r} was set to {value}, but is {read[name]}")
         before = _trace(tried, actions, seed, {})
         for name, value in given.items():
-            changed = (
-                None if name in tried.inside.interface.input_names else _changed(tried, name, value)
-            )
+            changed = _changed(tried, name, value)
             if changed is not None and _trace(tried, actions, seed, {name: changed}) == before:
                 logger.warning(
                     "parameter %r has no effect on the outputs: %g gives the same as %g",
@@ -270,7 +265,9 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 def _changed(env: FMUEnv, name: str, value: float) -> float | None:
-    """Return a value one percent away, in the range of a Real; None for other types."""
+    """Return a value one percent away, in the range of a Real; None for inputs and other types."""
+    if name in env.inside.interface.input_names:
+        return None
     variable = env.fmu.variable(name)
     if variable.kind != "real":
         return None
