@@ -125,6 +125,9 @@ class CountedPool(Pool):
         self.statuses, self._counts = arrays.statuses, arrays.counts
         self.num_instances = len(arrays.statuses)
 
+    def _as_mask(self, mask: MaskArray | None) -> MaskArray:
+        return np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask, np.bool_)
+
     @property
     def reset_method(self) -> ResetMethod:
         """See ``Pool.reset_method``."""

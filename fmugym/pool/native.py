@@ -3,10 +3,8 @@
 Its results do not depend on the number of threads. Beyond the contract of ``Pool``, it offers the
 vector environment its internal arrays and calls without any conversion:
 
-* write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
-  ``pool.observations``;
-* ``pool.step_into`` and ``pool.reset_into`` write the observations to the caller's memory and
-  return how many instances had trouble; the caller reads the statuses only if there are any.
+write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
+``pool.observations``.
 """
 
 from __future__ import annotations
@@ -169,7 +167,11 @@ class NativePool(AskingPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        self.step_into(None, skip, observations)
+        try:
+            self._pool.step(None, skip, observations)
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
+            self._open_pool().step(None, _as_mask(skip), observations)
         return self._result
 
     def save(self) -> _native.Snapshot:
@@ -267,60 +269,19 @@ class NativePool(AskingPool):
             raise SimulationError("the pool is closed")
         return self._pool
 
-    # The fast way.
-
-    def step_into(
-        self,
-        inputs: FloatArray | None = None,
-        skip: MaskArray | None = None,
-        observations: FloatArray32 | None = None,
-    ) -> int:
-        """Do one step as ``step`` does.
-
-        Args:
-            inputs: As for ``step``, but used in place and not copied to ``self.inputs``.
-            skip: As for ``step``.
-            observations: As for ``step``.
-
-        Returns:
-            How many of the instances that were stepped have a status worse than a warning.
-        """
-        try:
-            return self._pool.step(inputs, skip, observations)
-        except (TypeError, BufferError, ValueError) as error:
-            require_refusal(error)
-            pool = self._open_pool()
-            inputs = None if inputs is None else np.asarray(inputs, np.float64)
-            return pool.step(inputs, _as_mask(skip), observations)
-
-    def reset_into(
-        self,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray | None = None,
-        observations: FloatArray32 | None = None,
-    ) -> int:
-        """Start instances anew as ``reset`` does.
-
-        Args:
-            variables: As for ``reset``.
-            values: As for ``reset``.
-            mask: As for ``reset``.
-            observations: The rows of the instances in the mask are filled.
-
-        Returns:
-            How many of the instances in the mask have a status worse than a warning.
-        """
+    def _reset_some(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> None:
+        """See ``RetryingPool._reset_some``."""
         access = self._accesses.get(variables) or self._access(variables)
         try:
-            return self._reset(access, values, mask, observations)
+            self._reset(access, values, mask, None)
         except (TypeError, BufferError, ValueError) as error:
             require_refusal(error)
             self._open_pool()
-            values = np.asarray(values, np.float64)
-            return self._reset(access, values, _as_mask(mask), observations)
+            self._reset(access, np.asarray(values, np.float64), _as_mask(mask), None)
 
-    _reset_some = reset_into
+    # Steps with compiled hooks.
 
     def prepare_play(
         self,

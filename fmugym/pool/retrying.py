@@ -77,7 +77,7 @@ class RetryingPool(CountedPool):
         mask: MaskArray | None,
     ) -> None:
         """Reset instances; those that get no licence are reset again."""
-        chosen = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask)
+        chosen = self._as_mask(mask)
         what = f"{name}: the initialization of {np.count_nonzero(chosen)} instance(s)"
 
         def attempt() -> None:

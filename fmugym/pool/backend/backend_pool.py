@@ -116,7 +116,7 @@ class BackendPool(CountedPool):
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
         self._require_open()
-        chosen = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask)
+        chosen = self._as_mask(mask)
         given = [not (self._is_real and is_start_time(v)) for v in variables]  # it begins now
         values = values[given]
         own = [v for v, is_given in zip(variables, given, strict=True) if is_given]

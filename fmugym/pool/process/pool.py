@@ -157,11 +157,6 @@ class ProcessPool(AskingPool):
                 concerned = self._reset(concerned, variables, values, mask)
             self._group.note_lost()
 
-    def _as_mask(self, mask: MaskArray | None) -> MaskArray:
-        if mask is None:
-            return np.ones(self.num_instances, np.bool_)
-        return np.asarray(mask, np.bool_)
-
     def _reset(
         self,
         supervisors: Sequence[Supervisor],
@@ -212,27 +207,13 @@ class ProcessPool(AskingPool):
         observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
-        self.step_into(inputs, skip, observations)
-        return self.outputs, self.statuses
-
-    def step_into(
-        self,
-        inputs: FloatArray | None = None,
-        skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
-    ) -> int:
-        """Do one step as ``step`` does.
-
-        Returns:
-            How many of the instances have a status worse than a warning.
-        """
         with self._lock:
             if inputs is not None:
                 np.copyto(self.inputs, inputs)
-            troubled = self._step(skip)
+            self._step(skip)
             if observations is not None:
                 np.copyto(observations, self.observations)
-            return troubled
+            return self.outputs, self.statuses
 
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
@@ -331,28 +312,24 @@ class ProcessPool(AskingPool):
         with self._lock:
             supervisor = self._group.of(index)
             if not self._group.lost[index]:
-                within = index - supervisor.block.start
+                within, tell = index - supervisor.block.start, supervisor.answers.failure
                 content = Writer().integers(within).form()
-                texts = self._group.run(
-                    "a question",
-                    [supervisor],
-                    lambda s: s.tell(
-                        Request.FAILURE,
-                        content,
-                        lambda reader: s.answers.failure(reader, within),
-                    ),
-                )
-                for text in texts.values():
+                for text in self._answers(
+                    [supervisor], Request.FAILURE, content, lambda reader: tell(reader, within)
+                ):
                     return f"{text}{supervisor.printed}"
             return supervisor.reason
+
+    def _answers(self, supervisors: Sequence[Supervisor], *question: Any) -> list[Any]:
+        """Ask workers for what takes no time; see ``Supervisor.tell``."""
+        replies = self._group.run("a question", supervisors, lambda s: s.tell(*question))
+        return list(replies.values())
 
     def _count_steps(self) -> None:
         """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
         with self._lock:
             if not self._group.refusal:
-                self._group.run(
-                    "a question", self._group.able, lambda s: s.tell(Request.COUNT_STEPS)
-                )
+                self._answers(self._group.able, Request.COUNT_STEPS)
 
     def _memory_growth(self) -> HealthArray:
         growth = np.zeros(self.num_instances, np.int64)
@@ -365,14 +342,9 @@ class ProcessPool(AskingPool):
         with self._lock:
             if self._group.refusal or not self._gives_texts:
                 return None
-            group = self._group
             content = Writer().numbers(number).form()
-            answers = group.run(
-                "a question",
-                group.able,
-                lambda s: s.tell(Request.TEXT_OF, content, Reader.text),
-            )
-            return next(filter(None, answers.values()), None)
+            answers = self._answers(self._group.able, Request.TEXT_OF, content, Reader.text)
+            return next(filter(None, answers), None)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
