@@ -16,7 +16,7 @@ from lxml import etree
 
 from fmugym.archive.conversion import convert
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, over_limit
+from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, check_limit
 from fmugym.errors import FMULoadError, reason
 from fmugym.signals import ordinary
 
@@ -115,9 +115,8 @@ def read_xml(archive: SafeZip, place: str, limit: int) -> bytes:
     """
     name = archive.path.name
     content = archive.read(place, limit)
-    if len(content) > limit:
-        size = max(len(content), archive.files[place].file_size)
-        raise over_limit(f"{name}: {place} has {size} bytes", limit, "max_xml_bytes")
+    size = max(len(content), archive.files[place].file_size)
+    check_limit(f"{name}: {place} has {size} bytes", len(content), limit, "max_xml_bytes")
     try:
         content = _as_utf_8(content)
     except (UnicodeError, LookupError) as error:
@@ -166,9 +165,8 @@ def _encoding_of(content: bytes) -> str:
 def _check_size(name: str, content: bytes, max_variables: int) -> None:
     count = content.count(b"<") + content.count(b"=")
     limit = _MARKUP_PER_VARIABLE * max_variables + 1000
-    if count > limit:
-        found = f"{name}: {_XML} has some {count} elements and attributes"
-        raise over_limit(found, limit, "max_variables")
+    found = f"{name}: {_XML} has some {count} elements and attributes"
+    check_limit(found, count, limit, "max_variables")
 
 
 def _without_dependencies(content: bytes) -> bytes:
@@ -213,8 +211,7 @@ def _check_root(name: str, root: Any, max_variables: int) -> None:
             f"found <{root.tag} fmiVersion={version!r}>"
         )
     count = len(root.findall("ModelVariables/*"))
-    if count > max_variables:
-        raise over_limit(f"{name} has {count} variables", max_variables, "max_variables")
+    check_limit(f"{name} has {count} variables", count, max_variables, "max_variables")
 
 
 def _parse_with_fmpy(content: bytes) -> Any:

@@ -29,7 +29,7 @@ from fmugym.errors import FMULoadError, nearest_name, reason
 from fmugym.keys import LARGE_COUNT, check_fields, key
 from fmugym.signals import ordinary
 
-__all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
+__all__ = ["ArchiveLimits", "SafeZip", "check_limit"]
 
 _ZIP_ERRORS: Final = (
     OSError,
@@ -215,12 +215,12 @@ class SafeZip:
 
         Some tools leave out the slash at the end of a folder's name. Such an entry is empty.
         """
-        for place in [*self.files, *(f"{folder}/" for folder in self.folders)]:
-            for folder in _folders_above(place):
-                entry = self.files.get(folder)
-                if entry is not None and entry.file_size:
-                    raise self._refusal(entry, "is a file, but other files lie inside of it")
-                self.files.pop(folder, None)
+        places = (PurePosixPath(place) for place in (*self.files, *self.folders))
+        above = [str(folder) for place in places for folder in place.parents]
+        for folder in dict.fromkeys([*self.folders, *above]):
+            entry = self.files.pop(folder, None)
+            if entry is not None and entry.file_size:
+                raise self._refusal(entry, "is a file, but other files lie inside of it")
         self._check_case()
 
     def _check_case(self) -> None:
@@ -357,43 +357,37 @@ def _what_is_there(path: Path) -> str:
 
 def _check_sizes(path: Path, entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> None:
     """Compare the sizes that the directory gives; zipfile never unpacks more of a file."""
-    _check_limit(path, "has {} files", len(entries), limits, "max_entries")
-    size = sum(entry.file_size for entry in entries)
-    _check_limit(path, "unpacks to {} bytes", size, limits, "max_extracted_bytes")
+    name, count = path.name, len(entries)
+    check_limit(f"{name} has {count} files", count, limits.max_entries, "max_entries")
+    size, most = sum(entry.file_size for entry in entries), limits.max_extracted_bytes
+    check_limit(f"{name} unpacks to {size} bytes", size, most, "max_extracted_bytes")
     if size > _SMALL:
         ratio = -(-size // path.stat().st_size)
-        _check_limit(path, "unpacks to {} times its size", ratio, limits, "max_ratio")
+        found = f"{name} unpacks to {ratio} times its size"
+        check_limit(found, ratio, limits.max_ratio, "max_ratio")
 
 
-def _check_limit(path: Path, what: str, value: int, limits: ArchiveLimits, name: str) -> None:
-    limit = getattr(limits, name)
-    if value > limit:
-        raise over_limit(f"{path.name} {what.format(value)}", limit, name)
-
-
-def over_limit(found: str, limit: int, name: str) -> FMULoadError:
-    """Make the error for what is too large.
+def check_limit(found: str, value: int, limit: int, name: str) -> None:
+    """Refuse what is too large.
 
     Args:
         found: What was found, with the name of the FMU.
+        value: How large it is.
         limit: The limit.
         name: The attribute of ``ArchiveLimits`` that sets the limit.
+
+    Raises:
+        FMULoadError: If the value is above the limit.
     """
-    return FMULoadError(
-        f"{found}, the limit is {limit}; if you trust it, raise {name} of ArchiveLimits"
-    )
+    if value > limit:
+        raise FMULoadError(
+            f"{found}, the limit is {limit}; if you trust it, raise {name} of ArchiveLimits"
+        )
 
 
 def _escapes(name: str) -> bool:
     """Whether a path is absolute, has a Windows drive, or climbs to a folder above."""
     return name.startswith("/") or name[1:2] == ":" or ".." in name.split("/")
-
-
-def _folders_above(place: str) -> Iterator[str]:
-    folder = place.rpartition("/")[0]
-    while folder:
-        yield folder
-        folder = folder.rpartition("/")[0]
 
 
 def _link_target(archive: zipfile.ZipFile, place: str, link: zipfile.ZipInfo) -> str:
