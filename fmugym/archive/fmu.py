@@ -122,7 +122,7 @@ class FMU(KnownArguments):
         self.interface = interface
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
-        description = read_model_description(self._archive, self.limits, interface)
+        description = read_model_description(self._archive, interface)
         if sizes:
             self.sizes = check_mapping("sizes", sizes)
             description = description.resized(self.sizes)
@@ -196,7 +196,7 @@ class FMU(KnownArguments):
         Raises:
             FMULoadError: If the archive has been changed or removed.
         """
-        return read_feedthrough(read_root(self._archive, self.limits), self.description)
+        return read_feedthrough(read_root(self._archive), self.description)
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:

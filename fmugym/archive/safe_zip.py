@@ -18,7 +18,7 @@ import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -99,7 +99,7 @@ class SafeZip:
         limits: What is too large.
 
     Attributes:
-        path: As given.
+        path, limits: As given.
         files: zipfile's record of each file, by its place: a relative path with slashes, inside of
             the folder to which the archive is extracted.
         folders: The places of the folders that have an entry of their own.
@@ -110,7 +110,7 @@ class SafeZip:
     """
 
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self.path = path
+        self.path, self.limits = path, limits
         self.files: dict[str, zipfile.ZipInfo] = {}
         self.folders: set[str] = set()
         self.notes: list[str] = []
@@ -123,16 +123,27 @@ class SafeZip:
             raise FMULoadError(
                 f"{path.name} is not an FMU (a zip archive): {reason(error)}"
             ) from None
-        _check_sizes(path, entries, limits)
+        self._check_sizes(entries)
         self._links: dict[str, zipfile.ZipInfo] = {}
         for entry in entries:
             self._add(entry)
         if self._links:
             self._follow_links()
-            _check_sizes(path, list(self.files.values()), limits)
+            self._check_sizes(self.files.values())
         self._check_folders()
 
     # Reading the directory
+
+    def _check_sizes(self, entries: Collection[zipfile.ZipInfo]) -> None:
+        """Compare the sizes that the directory gives; zipfile never unpacks more of a file."""
+        name, limits, count = self.path.name, self.limits, len(entries)
+        check_limit(f"{name} has {count} files", count, limits.max_entries, "max_entries")
+        size, most = sum(entry.file_size for entry in entries), limits.max_extracted_bytes
+        check_limit(f"{name} unpacks to {size} bytes", size, most, "max_extracted_bytes")
+        if size > _SMALL:
+            ratio = -(-size // self.path.stat().st_size)
+            found = f"{name} unpacks to {ratio} times its size"
+            check_limit(found, ratio, limits.max_ratio, "max_ratio")
 
     def _add(self, entry: zipfile.ZipInfo) -> None:
         place = self._place(entry)
@@ -353,18 +364,6 @@ def _what_is_there(path: Path) -> str:
     there = (sorted(one.name for one in path.parent.glob(kind)) for kind in ("*.fmu", "*"))
     near = next(filter(None, (nearest_name(path.name, names) for names in there)), None)
     return "" if near is None else f"; did you mean {near!r}?"
-
-
-def _check_sizes(path: Path, entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> None:
-    """Compare the sizes that the directory gives; zipfile never unpacks more of a file."""
-    name, count = path.name, len(entries)
-    check_limit(f"{name} has {count} files", count, limits.max_entries, "max_entries")
-    size, most = sum(entry.file_size for entry in entries), limits.max_extracted_bytes
-    check_limit(f"{name} unpacks to {size} bytes", size, most, "max_extracted_bytes")
-    if size > _SMALL:
-        ratio = -(-size // path.stat().st_size)
-        found = f"{name} unpacks to {ratio} times its size"
-        check_limit(found, ratio, limits.max_ratio, "max_ratio")
 
 
 def check_limit(found: str, value: int, limit: int, name: str) -> None:
