@@ -99,8 +99,6 @@ class WorkerGroup:
     def _finish(self, supervisor: Supervisor) -> None:
         try:
             supervisor.finish_opening(self._deadline(INSTANTIATION))
-        except RefusedError:
-            raise
         except LostError:
             if not supervisor.opens_again():
                 raise
