@@ -426,7 +426,8 @@ class Columns:
             name: self._at(name, part, column, times) * factor + offset
             for name, (column, factor, offset) in self._from.items()
         }
-        return times, [{name: float(v[k]) for name, v in values.items()} for k in range(len(times))]
+        rows = np.transpose([*values.values()]).tolist()
+        return times, [dict(zip(values, row, strict=True)) for row in rows]
 
     def _at(self, name: str, part: PlantLog, column: str, times: FloatArray) -> FloatArray:
         """The values of a variable from communication points on."""

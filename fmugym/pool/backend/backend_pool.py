@@ -80,9 +80,7 @@ class BackendPool(CountedPool):
 
     def _set_up(self, backend: Any) -> None:
         spec, paced, count = self._spec, self._paced, self.num_instances
-        self._schedule = None
-        if paced is not None:
-            self._schedule = Schedule(spec.time_step, paced.clock, count)
+        self._schedule = None if paced is None else Schedule(spec.time_step, paced.clock, count)
         self._rigs = [Rig(one, spec, self._now) for one in _backends(backend, count)]
         self._threads = [self._thread(index, rig) for index, rig in enumerate(self._rigs)]
         shared = backend if _makes_backends(backend) else None
