@@ -6,7 +6,7 @@ Needs the extra ``pettingzoo``. See ``docs/systems.md``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -60,8 +60,8 @@ class _Part:
     actions: list[int]
     observations: list[int]
     reward: str | None
-    action_space: spaces.Space[Any] = field(compare=False)
-    observation_space: spaces.Box = field(compare=False)
+    action_space: spaces.Space[Any]
+    observation_space: spaces.Box
 
 
 class FMUParallelEnv(ParallelEnv[str, Array, Array]):
