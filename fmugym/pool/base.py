@@ -247,11 +247,15 @@ class Pool(ABC):
         """Whether ``roll_out`` does many steps of compiled hooks in one call."""
         return self.plays_alone
 
-    def prepare_play(self, *parts: Any) -> Play:
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """Prepare steps with compiled hooks.
 
         Args:
-            parts: As for ``NativePool.prepare_play``.
+            variables: As for ``reset``.
+            parts: As for ``fmugym.pool.native.prepare``.
+
+        Returns:
+            The functions that do the steps, and resets where the pool has one of its own.
 
         Raises:
             SimulationError: If the pool does not support it.

@@ -283,53 +283,10 @@ class NativePool(AskingPool):
 
     # Steps with compiled hooks.
 
-    def prepare_play(
-        self,
-        variables: tuple[Variable, ...],
-        programs: tuple[tuple[Any, ...], tuple[Any, ...]],
-        actions: Mapping[str, Any],
-        start_values: FloatArray,
-        draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
-        episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-        surroundings: Mapping[str, Any],
-    ) -> Play:
-        """Prepare the pool for steps of a vector environment, hooks included.
-
-        This replaces what was prepared before. Every step uses the given arrays in place.
-
-        Args:
-            variables: As for ``reset``.
-            programs: From the actions to the inputs; from the outputs to done, truncated, reward.
-                See ``Program.with_rows``.
-            actions: How actions are checked and kept: the shape of one action; the letter of its
-                type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
-                from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
-                actions of this step and of the one before (or None), flat, environments first;
-                what counts as the action of a new episode.
-            start_values: As the values of ``reset``; the pool writes the draws there.
-            draws: The draws of an episode, and the random streams, shape (N, 6); see
-                ``EpisodeStreams``.
-            episodes: Steps of each episode, shape (N,); which environments start an episode in
-                the next step, shape (N,); steps after which an episode is truncated.
-            surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
-                the second program reads them; ``done``, for where the latest step has ended the
-                task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
-                they were before the step; ``drawn_variables``, rows and the numbers of their draws;
-                ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
-                each input the number of a start value, or -1 and a constant. ``results``, None if
-                only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
-                tuple; the forms of observations and of infos, each the number of an array, or a
-                tuple of names and forms; the shape and type of each array: float32 observations, or
-                those that the second program stores, then rewards, terminated and truncated of a
-                step, mask and drawn values (draws, N) of a reset; and a function of drawn values
-                and a mask, which returns what infos tell of the episodes that start.
-
-        Returns:
-            The functions that do the steps and the resets. The memory that resets allocate is added
-            to the growth counter.
-        """
-        start, pool = self._access(variables), self._pool
-        prepare(pool, start, programs, actions, start_values, draws, episodes, surroundings)
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
+        """See ``Pool.prepare_play``; the memory that resets allocate is added to the growth."""
+        pool = self._pool
+        prepare(pool, self._access(variables), *parts)
         step, reset = self._watched_play
         return Play(pool.play_before, pool.play_after, pool.play, step, reset)
 
@@ -351,9 +308,49 @@ class NativePool(AskingPool):
         return self._pool.step_one
 
 
-def prepare(pool: _native.Pool, start: _native.Access, *parts: Any) -> None:
-    """Do ``NativePool.prepare_play``, with the access to its variables."""
-    programs, actions, start_values, draws, (counts, ended, limit), surroundings = parts
+def prepare(
+    pool: _native.Pool,
+    start: _native.Access,
+    programs: tuple[tuple[Any, ...], tuple[Any, ...]],
+    actions: Mapping[str, Any],
+    start_values: FloatArray,
+    draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
+    episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
+    surroundings: Mapping[str, Any],
+) -> None:
+    """Prepare a pool for steps of a vector environment, hooks included.
+
+    This replaces what was prepared before. Every step uses the given arrays in place.
+
+    Args:
+        pool: The pool.
+        start: To the start variables, as for ``Pool.reset``.
+        programs: From the actions to the inputs; from the outputs to done, truncated, reward.
+            See ``Program.with_rows``.
+        actions: How actions are checked and kept: the shape of one action; the letter of its
+            type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
+            from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
+            actions of this step and of the one before (or None), flat, environments first;
+            what counts as the action of a new episode.
+        start_values: As the values of ``reset``; the pool writes the draws there.
+        draws: The draws of an episode, and the random streams, shape (N, 6); see
+            ``EpisodeStreams``.
+        episodes: Steps of each episode, shape (N,); which environments start an episode in
+            the next step, shape (N,); steps after which an episode is truncated.
+        surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
+            the second program reads them; ``done``, for where the latest step has ended the
+            task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
+            they were before the step; ``drawn_variables``, rows and the numbers of their draws;
+            ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
+            each input the number of a start value, or -1 and a constant. ``results``, None if
+            only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
+            tuple; the forms of observations and of infos, each the number of an array, or a
+            tuple of names and forms; the shape and type of each array: float32 observations, or
+            those that the second program stores, then rewards, terminated and truncated of a
+            step, mask and drawn values (draws, N) of a reset; and a function of drawn values
+            and a mask, which returns what infos tell of the episodes that start.
+    """
+    counts, ended, limit = episodes
     rows = Rows()
     pool.prepare_play(
         form=form_of_play(rows, programs, actions, limit, surroundings),

@@ -96,11 +96,11 @@ class BackendPool(CountedPool):
         hold_after = paced.time_until_hold(self._spec.time_step)
         return Worker(name, paced.clock, Idle(rig.hold, hold_after))
 
-    def prepare_play(self, *parts: Any) -> Play:
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""
         from fmugym.pool.around import play_around
 
-        return play_around(self, self._spec, *parts)
+        return play_around(self, self._spec, variables, *parts)
 
     @property
     def is_real(self) -> bool:

@@ -67,19 +67,13 @@ class ProcessPool(AskingPool):
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
-        own_files: Whether each worker has a copy of the FMU's files, which is also its working
-            directory.
-        private_libraries: See ``NativePool``.
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
         closing_time: How long workers may take to free their instances in ``close``, in seconds;
             by default 5, or ``call_timeout`` if that is shorter.
-        checks_heap: Whether the C library ends workers that free memory beyond which an FMU has
-            written; only with glibc.
-        on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
-            this process, and the random numbers of the C library differ from worker to worker.
         make_group: What makes the workers, of the same arguments as a ``WorkerGroup``.
+        options: As for ``Setup.of``.
 
     Attributes:
         workers: How many processes there are.
@@ -99,13 +93,10 @@ class ProcessPool(AskingPool):
         *,
         workers: int | None = None,
         threads: int | None = None,
-        own_files: bool = False,
-        private_libraries: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
         closing_time: float | None = None,
-        checks_heap: bool = False,
-        on_trial: bool = False,
         make_group: Callable[..., WorkerGroup] = WorkerGroup,
+        **options: bool,
     ) -> None:
         self._spec = spec
         self._lock = RLock()
@@ -113,17 +104,8 @@ class ProcessPool(AskingPool):
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
-            setup = Setup.of(
-                fmu,
-                spec,
-                num_instances,
-                log,
-                threads=threads or max(1, available_processors() // self.workers),
-                own_files=own_files,
-                private_libraries=private_libraries,
-                checks_heap=checks_heap,
-                on_trial=on_trial,
-            )
+            threads = threads or max(1, available_processors() // self.workers)
+            setup = Setup.of(fmu, spec, num_instances, log, threads=threads, **options)
             memory = _make_memory(spec, num_instances, self.workers)
         except BaseException:
             fmu.close()
@@ -235,13 +217,13 @@ class ProcessPool(AskingPool):
 
     # Compiled hooks
 
-    def prepare_play(self, *parts: Any) -> Play:
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""
         from fmugym.pool.around import play_around
 
         self._plays += 1
         self._parts, self._play = parts, None
-        return play_around(self, self._spec, *parts)
+        return play_around(self, self._spec, variables, *parts)
 
     @property
     def rolls_out(self) -> bool:
@@ -275,7 +257,7 @@ class ProcessPool(AskingPool):
     def _describe_play(self) -> PlayOfWorkers:
         from fmugym.pool.process.worker_rollouts import PlayOfWorkers
 
-        return PlayOfWorkers(self._arrays, self._parts[1:])
+        return PlayOfWorkers(self._arrays, self._parts)
 
     def save(self) -> SnapshotOfWorkers:
         """See ``SavingPool.save``."""

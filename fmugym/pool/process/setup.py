@@ -52,8 +52,10 @@ class Setup:
         threads: See ``NativePool``.
         own_files: Whether the worker has a copy of the folder, which is also its working
             directory, because instances would share files otherwise.
-        checks_heap: See ``ProcessPool``.
-        on_trial: See ``ProcessPool``.
+        checks_heap: Whether the C library ends workers that free memory beyond which an FMU has
+            written; only with glibc.
+        on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
+            this process, and the random numbers of the C library differ from worker to worker.
         wine: What the worker needs to run in Wine; None for one of this system.
     """
 
@@ -87,7 +89,13 @@ class Setup:
     ) -> Setup:
         """Extract an FMU, and say what a worker for all of its instances needs to know.
 
-        The options are those attributes that have a default.
+        Args:
+            fmu: The FMU.
+            spec: What to do at each reset and step.
+            num_instances: N.
+            log: The logger that gets the FMU's messages.
+            private_libraries: See ``NativePool``.
+            options: Those attributes that have a default.
         """
         folder = fmu.extract()
         return cls(
