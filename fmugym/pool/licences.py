@@ -13,11 +13,12 @@ import numpy as np
 
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import Pool
+from fmugym.pool.base import MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 
 __all__ = [
     "licence_errors",
+    "refusals",
     "require_licence",
     "require_started",
     "speaks_of_licence",
@@ -75,10 +76,15 @@ def require_licence(pool: Pool) -> None:
     Raises:
         LicenceError: If one of them got no licence.
     """
-    for index in np.flatnonzero(pool.statuses > WARNING_CODE).tolist():
-        failure = pool.failure(index)
-        if speaks_of_licence(failure):
-            raise LicenceError(failure)
+    for failure in refusals(pool).values():
+        raise LicenceError(failure)
+
+
+def refusals(pool: Pool, chosen: MaskArray | bool = True) -> dict[int, str]:
+    """The texts of the instances among the chosen ones that got no licence, by their index."""
+    failed = np.flatnonzero(chosen & (pool.statuses > WARNING_CODE)).tolist()
+    texts = {index: pool.failure(index) for index in failed}
+    return {index: text for index, text in texts.items() if speaks_of_licence(text)}
 
 
 def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:

@@ -12,10 +12,9 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import LicenceError
-from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import CountedPool
-from fmugym.pool.licences import speaks_of_licence, wait_for_licence
+from fmugym.pool.licences import refusals, wait_for_licence
 from fmugym.pool.progress import progress
 
 __all__ = ["RetryingPool"]
@@ -84,17 +83,10 @@ class RetryingPool(CountedPool):
             nonlocal chosen
             with progress(log, what):
                 self._reset_some(variables, values, chosen)
-            refused = _refusals(self, chosen)
+            refused = refusals(self, chosen)
             if refused:
                 chosen = np.isin(np.arange(self.num_instances), list(refused))
                 raise LicenceError(next(iter(refused.values())))
 
         with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
             wait_for_licence(self._spec.licence_wait, log, attempt)
-
-
-def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
-    """The texts of the instances among the chosen ones that got no licence."""
-    failed = np.flatnonzero(chosen & (pool.statuses > WARNING_CODE)).tolist()
-    texts = {index: pool.failure(index) for index in failed}
-    return {index: text for index, text in texts.items() if speaks_of_licence(text)}
