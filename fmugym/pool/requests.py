@@ -178,13 +178,18 @@ class Answers:
         """Read why an instance has failed, counted within the block; "" if it has not."""
         if not reader.integer():
             return ""
-        doing, in_warm_up, status = reader.text(), bool(reader.integer()), reader.integer()
-        time, reference, said = reader.number(), reader.integer(), reader.text()
-        has_values, values, part = bool(reader.integer()), reader.block(), reader.text()
-        reader.end()
         failure = Failure(
-            doing, in_warm_up, status, time, reference, said, values if has_values else None, part
+            doing=reader.text(),
+            in_warm_up=bool(reader.integer()),
+            status=reader.integer(),
+            time=reader.number(),
+            reference=reader.integer(),
+            said=reader.text(),
+            has_values=bool(reader.integer()),
+            values=reader.block(),
+            part=reader.text(),
         )
+        reader.end()
         name = f"{self._description.model_identifier}_{self._block.start + index}"
         try:
             return describe_failure(failure, self._description, self._spec, name)
