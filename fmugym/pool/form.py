@@ -20,7 +20,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.archive.description import Capabilities, ModelDescription
+from fmugym.archive.description import Capabilities, ModelDescription, ModelExchange
 from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of
 from fmugym.archive.variable import Variable, unlisted
@@ -326,23 +326,20 @@ def _write_solving(writer: Writer, description: ModelDescription, spec: PoolSpec
     writer.integers(solves)
     if not solves:
         return
-    tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
     if model is None:
-        writer.text(b"by_fmu")
-        writer.numbers(1.0, math.inf)
-        writer.integers(0, 0, False)
+        model = ModelExchange(0, 0, False)
+        writer.text(b"by_fmu").numbers(1.0, math.inf)
     else:
-        writer.text(spec.solver.encode())
-        writer.numbers(tolerance, spec.max_step or math.inf)
-        writer.integers(
-            model.number_of_states,
-            model.number_of_event_indicators,
-            model.needs_completed_integrator_step,
-        )
+        tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
+        writer.text(spec.solver.encode()).numbers(tolerance, spec.max_step or math.inf)
+    writer.integers(
+        model.number_of_states,
+        model.number_of_event_indicators,
+        model.needs_completed_integrator_step,
+    )
     differentiable = description.capabilities.provides_directional_derivatives
-    known = model if differentiable and model is not None else None
-    writer.array(() if known is None else known.state_references, np.uint32)
-    writer.array(() if known is None else known.derivative_references, np.uint32)
+    writer.array(model.state_references if differentiable else (), np.uint32)
+    writer.array(model.derivative_references if differentiable else (), np.uint32)
     for block in _clocks(description):
         writer.block(block)
 

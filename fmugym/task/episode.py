@@ -95,8 +95,7 @@ class EpisodeDraws:
             for variable, (name, value) in zip(model_variables, parameters.items(), strict=True)
         ]
         self.constants = np.array(constants, np.float64)
-        strings = (v.name for v in model_variables if v.kind == "string")
-        self.strings = frozenset(strings)
+        self.strings = frozenset(v.name for v in model_variables if v.kind == "string")
         self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
         self._variables.update((name, array.constants) for name, array in self._arrays.items())
         self._random_variables = {

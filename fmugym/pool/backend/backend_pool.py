@@ -7,6 +7,7 @@ import math
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import compress
 from typing import Any, Final
 
 import numpy as np
@@ -116,8 +117,7 @@ class BackendPool(CountedPool):
         self._require_open()
         chosen = self._as_mask(mask)
         given = [not (self._is_real and is_start_time(v)) for v in variables]  # it begins now
-        values = values[given]
-        own = [v for v, is_given in zip(variables, given, strict=True) if is_given]
+        own, values = list(compress(variables, given)), values[given]
         starts = {
             index: values_by_name(own, values[:, index].tolist())
             for index in np.flatnonzero(chosen).tolist()
