@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -34,8 +34,7 @@ _SHORT_EPISODE: Final = 3
 """In steps."""
 
 
-@dataclass(frozen=True)
-class _Transition:
+class _Transition(NamedTuple):
     observation: Any
     reward: float
     terminated: bool
@@ -154,8 +153,7 @@ def _episode(env: FMUEnv, actions: list[Any], start: _Start) -> list[_Transition
 
 def _require_equal(what: str, first: list[_Transition], second: list[_Transition]) -> None:
     for index, (a, b) in enumerate(zip(first, second, strict=False)):
-        for name in ("observation", "reward", "terminated", "truncated", "outputs"):
-            left, right = getattr(a, name), getattr(b, name)
+        for name, left, right in zip(a._fields, a, b, strict=True):
             if not data_equivalence(left, right, exact=True):
                 raise ContractError(f"{what}: at step {index} {name} was {left}, then {right}")
     if len(first) != len(second):
