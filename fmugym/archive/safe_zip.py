@@ -226,9 +226,9 @@ class SafeZip:
 
         Some tools leave out the slash at the end of a folder's name. Such an entry is empty.
         """
-        places = (PurePosixPath(place) for place in (*self.files, *self.folders))
-        above = [str(folder) for place in places for folder in place.parents]
-        for folder in dict.fromkeys([*self.folders, *above]):
+        inside = [*self.files, *(f"{folder}/file" for folder in self.folders)]
+        above = [str(folder) for place in inside for folder in PurePosixPath(place).parents]
+        for folder in dict.fromkeys(above):
             entry = self.files.pop(folder, None)
             if entry is not None and entry.file_size:
                 raise self._refusal(entry, "is a file, but other files lie inside of it")
