@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
+from functools import partial
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -87,7 +88,7 @@ class Uniform(KnownArguments):
     distribution: str = _kind("uniform")
 
     def __post_init__(self) -> None:
-        _take_finite(self, "low", "high")
+        _take(self, check_number, "low", "high")
         if self.low > self.high:
             raise ConfigError(f"{self}: low must not be greater than high")
         if not math.isfinite(self.high - self.low):
@@ -114,7 +115,7 @@ class LogUniform(KnownArguments):
     distribution: str = _kind("log_uniform")
 
     def __post_init__(self) -> None:
-        _take_finite(self, "low", "high")
+        _take(self, check_number, "low", "high")
         if not 0 < self.low <= self.high:
             raise ConfigError(f"{self}: the bounds must satisfy 0 < low <= high")
 
@@ -143,8 +144,8 @@ class Normal(KnownArguments):
     distribution: str = _kind("normal")
 
     def __post_init__(self) -> None:
-        _take_finite(self, "mean", "std")
-        _take(self, "low", "high")
+        _take(self, check_number, "mean", "std")
+        _take(self, number_of, "low", "high")
         if self.std < 0:
             raise ConfigError(f"{self}: std must not be negative")
         object.__setattr__(self, "std", abs(self.std))  # numpy refuses -0.0
@@ -190,7 +191,8 @@ class Choice(KnownArguments):
         values = _items(self.values)
         if not values:
             raise ConfigError(f"Choice: expected a list of at least one value, {_got(self.values)}")
-        values = [value if isinstance(value, str) else _finite(self, value) for value in values]
+        check = partial(check_number, f"{type(self).__name__}: a value", may_be_boolean=True)
+        values = [value if isinstance(value, str) else check(value) for value in values]
         object.__setattr__(self, "values", tuple(values))
         if self.probabilities is not None:
             object.__setattr__(self, "probabilities", self._checked_probabilities())
@@ -276,10 +278,7 @@ class Truncated:
 
 
 _KINDS: Final[Mapping[str, type[Any]]] = {
-    "uniform": Uniform,
-    "log_uniform": LogUniform,
-    "normal": Normal,
-    "choice": Choice,
+    kind.distribution: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
 _OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), Column)
 _LARGEST: Final = float(np.finfo(np.float64).max)
@@ -451,25 +450,11 @@ def _items(values: Any) -> list[Any]:
         return []
 
 
-def _take_finite(distribution: Any, *names: str) -> None:
-    """Turn fields into finite floats."""
-    _take(distribution, *names)
+def _take(distribution: Any, check: Callable[[str, Any], float], *names: str) -> None:
+    """Turn fields into floats that a check lets through."""
     for name in names:
-        _finite(distribution, getattr(distribution, name), name)
-
-
-def _take(distribution: Any, *names: str) -> None:
-    for name in names:
-        value = number_of(f"{_name(distribution)}: {name}", getattr(distribution, name))
+        value = check(f"{type(distribution).__name__}: {name}", getattr(distribution, name))
         object.__setattr__(distribution, name, value)
-
-
-def _finite(distribution: Any, value: Any, name: str = "a value") -> float:
-    return check_number(f"{_name(distribution)}: {name}", value, may_be_boolean=True)
-
-
-def _name(distribution: Any) -> str:
-    return type(distribution).__name__
 
 
 def _got(value: Any) -> str:

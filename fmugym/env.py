@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final, Never
 import numpy as np
 from gymnasium import logger as gymnasium_logger
 
-from fmugym.archive.texts import text_of
+from fmugym.archive.texts import values_by_name
 from fmugym.checks import check_misplaced, check_option, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import (
@@ -424,11 +424,7 @@ class FMUEnv(Constructed):
         if not self.inside.was_reset:
             raise SimulationError("read_variables was called before the first reset")
         variables = readable_named(self.fmu.description, names)
-        values = pool.read(variables)[:, 0].tolist()
-        return {
-            variable.name: text_of(value) if variable.kind == "string" else value
-            for variable, value in zip(variables, values, strict=True)
-        }
+        return values_by_name(variables, pool.read(variables)[:, 0].tolist())
 
     @property
     @alone

@@ -245,8 +245,7 @@ class _Reading(NamedTuple):
             for n, one in table.keys.items()
             if one.default is not None and one.default is not REQUIRED
         }
-        is_made = table.make is not None and len(self.mistakes) == before
-        if table.make is not None and is_made:
+        if table.make is not None and len(self.mistakes) == before:
             return table.make(**given)
         right = {n: one for n, one in given.items() if one is not None or items[n] is None}
         return defaults | right

@@ -426,7 +426,8 @@ class Columns:
             name: self._at(name, part, column, times) * factor + offset
             for name, (column, factor, offset) in self._from.items()
         }
-        return times, [{name: float(v[k]) for name, v in values.items()} for k in range(len(times))]
+        rows = np.transpose([*values.values()]).tolist()
+        return times, [dict(zip(values, row, strict=True)) for row in rows]
 
     def _at(self, name: str, part: PlantLog, column: str, times: FloatArray) -> FloatArray:
         """The values of a variable from communication points on."""
@@ -525,19 +526,15 @@ def _candidates(space: spaces.Space[Any]) -> list[Any]:
     """
     if isinstance(space, spaces.Box):
         return _corners(space)
-    if isinstance(space, spaces.Discrete):
-        ranges: list[range] = [range(int(space.start), int(space.start + space.n))]
-    elif isinstance(space, spaces.MultiDiscrete):
-        low, counts = np.ravel(space.start), np.ravel(space.nvec)
-        ranges = [range(int(a), int(a + n)) for a, n in zip(low, counts, strict=True)]
-    else:
+    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         raise ConfigError(f"a log can be played with actions of numbers, not of {space}")
+    counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
+    pairs = zip(np.ravel(space.start).tolist(), np.ravel(counts).tolist(), strict=True)
+    ranges = [range(first, first + count) for first, count in pairs]
     if math.prod(map(len, ranges)) > _MOST_ACTIONS:
         raise ConfigError(f"{space} has more than {_MOST_ACTIONS} actions, too many to try out")
-    if isinstance(space, spaces.Discrete):
-        return [np.int64(number) for number in ranges[0]]
     shape, dtype = space.shape, space.dtype
-    return [np.array(one, dtype).reshape(shape) for one in itertools.product(*ranges)]
+    return [np.array(one, dtype).reshape(shape)[()] for one in itertools.product(*ranges)]
 
 
 def _corners(space: spaces.Box) -> list[Any]:

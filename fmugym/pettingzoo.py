@@ -6,17 +6,17 @@ Needs the extra ``pettingzoo``. See ``docs/systems.md``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.checks import check_mapping, check_text
+from fmugym.checks import check_mapping, check_option, check_text
 from fmugym.declared import TaskEnv
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.extras import lacking
 from fmugym.systems.system_description import SystemDescription
 
@@ -60,8 +60,8 @@ class _Part:
     actions: list[int]
     observations: list[int]
     reward: str | None
-    action_space: spaces.Space[Any] = field(compare=False)
-    observation_space: spaces.Box = field(compare=False)
+    action_space: spaces.Space[Any]
+    observation_space: spaces.Box
 
 
 class FMUParallelEnv(ParallelEnv[str, Array, Array]):
@@ -111,9 +111,7 @@ class FMUParallelEnv(ParallelEnv[str, Array, Array]):
         return self._found(agent).action_space
 
     def _found(self, agent: str) -> _Part:
-        if agent not in self._parts:
-            raise unknown_name("agent", agent, self._parts)
-        return self._parts[agent]
+        return self._parts[check_option("agent", agent, self._parts)]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -313,17 +311,12 @@ def _part(
 
 
 def _places(what: str, names: Sequence[str], known: Sequence[str]) -> list[int]:
-    for name in names:
-        if name not in known:
-            raise unknown_name(what, name, known)
-    return [known.index(name) for name in names]
+    return [known.index(check_option(what, name, known)) for name in names]
 
 
 def _require_reward(env: FMUEnv, name: str) -> None:
     rewards = env.task.root.child("reward").value if isinstance(env, TaskEnv) else None
-    known = list(rewards) if isinstance(rewards, Mapping) else []
-    if name not in known:
-        raise unknown_name("reward", name, known)
+    check_option("reward", name, rewards if isinstance(rewards, Mapping) else ())
 
 
 def _part_of(space: Any, places: list[int]) -> Any:

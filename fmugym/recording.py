@@ -169,7 +169,7 @@ def _facts(header: dict[str, Any]) -> dict[str, Any]:
     generator_of(state_of(list(stream)))  # which refuses what is none
     json.loads(header["options"])
     return {
-        **{name: header[name] for name in FACTS},
+        "options": header["options"],
         **{
             name: {key: str(text) for key, text in header[name].items()}
             for name in ("scope", "surroundings")

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -34,8 +34,7 @@ _SHORT_EPISODE: Final = 3
 """In steps."""
 
 
-@dataclass(frozen=True)
-class _Transition:
+class _Transition(NamedTuple):
     observation: Any
     reward: float
     terminated: bool
@@ -154,8 +153,7 @@ def _episode(env: FMUEnv, actions: list[Any], start: _Start) -> list[_Transition
 
 def _require_equal(what: str, first: list[_Transition], second: list[_Transition]) -> None:
     for index, (a, b) in enumerate(zip(first, second, strict=False)):
-        for name in ("observation", "reward", "terminated", "truncated", "outputs"):
-            left, right = getattr(a, name), getattr(b, name)
+        for name, left, right in zip(a._fields, a, b, strict=True):
             if not data_equivalence(left, right, exact=True):
                 raise ContractError(f"{what}: at step {index} {name} was {left}, then {right}")
     if len(first) != len(second):
@@ -195,10 +193,7 @@ def _other_start(env: FMUEnv, actions: list[Any], seed: int) -> _Start:
     """Another seed and, if the FMU runs with them, parameters that differ by one percent."""
     with _fresh(env) as tried:
         tried.reset(seed=seed)
-        given = {
-            n: v for n, v in tried.parameters.items() if n not in tried.inside.interface.input_names
-        }
-        changed = {name: _changed(tried, name, value) for name, value in given.items()}
+        changed = {n: _changed(tried, n, value) for n, value in tried.parameters.items()}
         start = _Start(
             seed + 1, {name: value for name, value in changed.items() if value is not None}
         )
@@ -257,9 +252,7 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
                 raise ContractError(f"parameter {name!r} was set to {value}, but is {read[name]}")
         before = _trace(tried, actions, seed, {})
         for name, value in given.items():
-            changed = (
-                None if name in tried.inside.interface.input_names else _changed(tried, name, value)
-            )
+            changed = _changed(tried, name, value)
             if changed is not None and _trace(tried, actions, seed, {name: changed}) == before:
                 logger.warning(
                     "parameter %r has no effect on the outputs: %g gives the same as %g",
@@ -270,7 +263,9 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 def _changed(env: FMUEnv, name: str, value: float) -> float | None:
-    """Return a value one percent away, in the range of a Real; None for other types."""
+    """Return a value one percent away, in the range of a Real; None for inputs and other types."""
+    if name in env.inside.interface.input_names:
+        return None
     variable = env.fmu.variable(name)
     if variable.kind != "real":
         return None

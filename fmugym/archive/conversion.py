@@ -34,6 +34,7 @@ _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
 
+_WORDS: Final = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 _ELEMENTS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
 
 
@@ -61,7 +62,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         model_name=source.modelName or "",
         model_identifier=_identifier(source, offer.modelIdentifier),
         instantiation_token=source.guid or "",
-        interfaces=_interfaces(source),
+        interfaces=tuple(_interfaces(source)),
         description=source.description or "",
         generation_tool=source.generationTool or "",
         start_time=_time(experiment, "startTime") or 0.0,
@@ -83,16 +84,13 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
 
 def _choose(source: Any, interface: str | None) -> tuple[str, Any]:
     """The interface to use, and FMPy's object for it."""
-    offers = {"co_simulation": source.coSimulation, "model_exchange": source.modelExchange}
-    offered = [name for name in INTERFACES if offers[name] is not None]
-    if interface is None and offered:
-        interface = offered[0]
-    if interface not in offered:
-        wanted = "co-simulation" if interface == "co_simulation" else "model exchange"
-        wanted = wanted if interface else "co-simulation or model exchange"
-        there = ", ".join(_interfaces(source)) or "none"
-        raise FMULoadError(f"{source.modelName} has no interface for {wanted}; it offers: {there}")
-    return interface, offers[interface]
+    offers = _interfaces(source)
+    wanted = INTERFACES if interface is None else [interface]
+    for name in wanted:
+        if _WORDS[name] in offers:
+            return name, offers[_WORDS[name]]
+    words, there = " or ".join(_WORDS[name] for name in wanted), ", ".join(offers) or "none"
+    raise FMULoadError(f"{source.modelName} has no interface for {words}; it offers: {there}")
 
 
 def _model_exchange(source: Any, offer: Any) -> ModelExchange:
@@ -169,13 +167,14 @@ def _derivatives(source: Any) -> dict[str, str]:
     return {d.derivative.name: d.name for d in derivatives if d.derivative}
 
 
-def _interfaces(source: Any) -> tuple[str, ...]:
+def _interfaces(source: Any) -> dict[str, Any]:
+    """FMPy's objects for the interfaces that the FMU offers, by their names."""
     offered = {
         "co-simulation": source.coSimulation,
         "model exchange": source.modelExchange,
         "scheduled execution": source.scheduledExecution,
     }
-    return tuple(name for name, interface in offered.items() if interface is not None)
+    return {name: offer for name, offer in offered.items() if offer is not None}
 
 
 def _identifier(source: Any, name: str | None) -> str:

@@ -122,13 +122,16 @@ class FMU(KnownArguments):
         self.interface = interface
         libraries = _absolute(preload)
         self._archive = SafeZip(file, self.limits)
-        description = read_model_description(self._archive, self.limits, interface)
+        description = read_model_description(self._archive, interface)
         if sizes:
             self.sizes = check_mapping("sizes", sizes)
             description = description.resized(self.sizes)
         self.path, self.description, self.preload = file, description, libraries
-        self._library_place, note = self._choose_library()
-        self.findings = (*self._archive.notes, *note, *self.description.findings)
+        self._library_place = place = self._choose_library()
+        findings = [*self._archive.notes]
+        if place not in (None, self.library):
+            findings.append(f"the library is {place!r}, expected {self.library!r}; it is used")
+        self.findings = (*findings, *self.description.findings)
         self._folder: Path | None = None
         self._remove_folder: weakref.finalize[..., FMU] | None = None
         self._log_findings()
@@ -142,16 +145,13 @@ class FMU(KnownArguments):
             f"{about.fmi_version}, {told})"
         )
 
-    def _choose_library(self) -> tuple[str | None, list[str]]:
+    def _choose_library(self) -> str | None:
         """Find the library for this platform, or else one for Windows that can run here in Wine."""
         places = list(self._archive.files)
-        found = _find_library(places, self.library)
-        if found[0] is not None or _libraries_in(places, self.library) or not can_run_windows():
-            return found
-        self.in_wine = True
-        in_wine = _find_library(places, self.library)
-        self.in_wine = bool(_libraries_in(places, self.library))
-        return in_wine if self.in_wine else found
+        if not _libraries_in(places, self.library) and can_run_windows():
+            self.in_wine = True
+            self.in_wine = bool(_libraries_in(places, self.library))
+        return _find_library(places, self.library)
 
     def _log_findings(self) -> None:
         if self.findings:
@@ -196,7 +196,7 @@ class FMU(KnownArguments):
         Raises:
             FMULoadError: If the archive has been changed or removed.
         """
-        return read_feedthrough(read_root(self._archive, self.limits), self.description)
+        return read_feedthrough(read_root(self._archive), self.description)
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:
@@ -470,24 +470,14 @@ def _digest(path: Path, *_: int) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:
-    """Find the library for this platform, which some tools give another name.
-
-    Args:
-        places: The places of all files.
-        wanted: The place of the library by the standard.
-
-    Returns:
-        Its place, or None; and a note if that is not the place by the standard.
-    """
+def _find_library(places: Sequence[str], wanted: str) -> str | None:
+    """Find the library for this platform, which some tools give another name; None if none fits."""
     if wanted in places:
-        return wanted, []
+        return wanted
     there = _libraries_in(places, wanted)
     same = [place for place in there if place.casefold() == wanted.casefold()]
     candidates = same or there
-    if len(candidates) != 1:
-        return None, []
-    return candidates[0], [f"the library is {candidates[0]!r}, expected {wanted!r}; it is used"]
+    return candidates[0] if len(candidates) == 1 else None
 
 
 def _libraries_in(places: Sequence[str], wanted: str) -> list[str]:

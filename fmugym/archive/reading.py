@@ -16,7 +16,7 @@ from lxml import etree
 
 from fmugym.archive.conversion import convert
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, over_limit
+from fmugym.archive.safe_zip import SafeZip, check_limit
 from fmugym.errors import FMULoadError, reason
 from fmugym.signals import ordinary
 
@@ -41,9 +41,7 @@ _ENCODINGS: Final = re.compile(r"utf-?8|(us-)?ascii|iso-?8859-\d+|(windows-|cp)1
 """Encodings in which neither ``<`` nor ``=`` can hide. FMI 2.0 and 3.0 ask for UTF-8."""
 
 
-def read_model_description(
-    archive: SafeZip, limits: ArchiveLimits, interface: str | None = None
-) -> ModelDescription:
+def read_model_description(archive: SafeZip, interface: str | None = None) -> ModelDescription:
     """Read the model description of an FMU. Nothing of the FMU is executed or extracted.
 
     FMUs may break rules of the standard, as many do: what FMPy's validation finds is kept in
@@ -51,7 +49,6 @@ def read_model_description(
 
     Args:
         archive: The FMU.
-        limits: What is too large to be read.
         interface: One of ``INTERFACES``; None for co-simulation, or else model exchange.
 
     Returns:
@@ -61,8 +58,8 @@ def read_model_description(
         FMULoadError: If the XML is missing, too large or unreadable, or lacks the interface.
     """
     name = archive.path.name
-    content = _without_dependencies(_read_content(archive, limits))
-    root = _parse_content(name, content, limits)
+    content = _without_dependencies(_read_content(archive))
+    root = _parse_content(archive, content)
     try:
         return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
@@ -73,7 +70,7 @@ def read_model_description(
         ) from error
 
 
-def read_root(archive: SafeZip, limits: ArchiveLimits) -> Any:
+def read_root(archive: SafeZip) -> Any:
     """Read the XML of an FMU with the dependencies, which no environment of one FMU needs.
 
     Returns:
@@ -82,20 +79,32 @@ def read_root(archive: SafeZip, limits: ArchiveLimits) -> Any:
     Raises:
         FMULoadError: If the XML is missing, too large or unreadable.
     """
-    return _parse_content(archive.path.name, _read_content(archive, limits), limits)
+    return _parse_content(archive, _read_content(archive))
 
 
-def _read_content(archive: SafeZip, limits: ArchiveLimits) -> bytes:
+def _read_content(archive: SafeZip) -> bytes:
+    name, limits = archive.path.name, archive.limits
     if _XML not in archive.files:
-        raise FMULoadError(f"{archive.path.name} is not an FMU: it has no {_XML}{_hint(archive)}")
+        raise FMULoadError(f"{name} is not an FMU: it has no {_XML}{_hint(archive)}")
     content = read_xml(archive, _XML, limits.max_xml_bytes)
-    _check_size(archive.path.name, content, limits.max_variables)
+    count = content.count(b"<") + content.count(b"=")
+    most = _MARKUP_PER_VARIABLE * limits.max_variables + 1000
+    found = f"{name}: {_XML} has some {count} elements and attributes"
+    check_limit(found, count, most, "max_variables")
     return content
 
 
-def _parse_content(name: str, content: bytes, limits: ArchiveLimits) -> Any:
+def _parse_content(archive: SafeZip, content: bytes) -> Any:
+    name, most = archive.path.name, archive.limits.max_variables
     root = parse_xml(name, _XML, content)
-    _check_root(name, root, limits.max_variables)
+    version = root.get("fmiVersion", "")
+    if root.tag != "fmiModelDescription" or not re.fullmatch(r"1\.0|2\.0(\.\d+)?|3\.\d.*", version):
+        raise FMULoadError(
+            f"{name}: expected a model description of FMI 1.0, 2.0 or 3.0, "
+            f"found <{root.tag} fmiVersion={version!r}>"
+        )
+    count = len(root.findall("ModelVariables/*"))
+    check_limit(f"{name} has {count} variables", count, most, "max_variables")
     return root
 
 
@@ -115,9 +124,8 @@ def read_xml(archive: SafeZip, place: str, limit: int) -> bytes:
     """
     name = archive.path.name
     content = archive.read(place, limit)
-    if len(content) > limit:
-        size = max(len(content), archive.files[place].file_size)
-        raise over_limit(f"{name}: {place} has {size} bytes", limit, "max_xml_bytes")
+    size = max(len(content), archive.files[place].file_size)
+    check_limit(f"{name}: {place} has {size} bytes", len(content), limit, "max_xml_bytes")
     try:
         content = _as_utf_8(content)
     except (UnicodeError, LookupError) as error:
@@ -163,14 +171,6 @@ def _encoding_of(content: bytes) -> str:
     return encoding
 
 
-def _check_size(name: str, content: bytes, max_variables: int) -> None:
-    count = content.count(b"<") + content.count(b"=")
-    limit = _MARKUP_PER_VARIABLE * max_variables + 1000
-    if count > limit:
-        found = f"{name}: {_XML} has some {count} elements and attributes"
-        raise over_limit(found, limit, "max_variables")
-
-
 def _without_dependencies(content: bytes) -> bytes:
     """Leave out on what the unknowns depend.
 
@@ -203,18 +203,6 @@ def parse_xml(name: str, place: str, content: bytes) -> Any:
         return etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
         raise FMULoadError(f"{name}: {place} is not valid XML: {reason(error)}") from None
-
-
-def _check_root(name: str, root: Any, max_variables: int) -> None:
-    version = root.get("fmiVersion", "")
-    if root.tag != "fmiModelDescription" or not re.fullmatch(r"1\.0|2\.0(\.\d+)?|3\.\d.*", version):
-        raise FMULoadError(
-            f"{name}: expected a model description of FMI 1.0, 2.0 or 3.0, "
-            f"found <{root.tag} fmiVersion={version!r}>"
-        )
-    count = len(root.findall("ModelVariables/*"))
-    if count > max_variables:
-        raise over_limit(f"{name} has {count} variables", max_variables, "max_variables")
 
 
 def _parse_with_fmpy(content: bytes) -> Any:

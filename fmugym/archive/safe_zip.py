@@ -18,7 +18,7 @@ import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -29,7 +29,7 @@ from fmugym.errors import FMULoadError, nearest_name, reason
 from fmugym.keys import LARGE_COUNT, check_fields, key
 from fmugym.signals import ordinary
 
-__all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
+__all__ = ["ArchiveLimits", "SafeZip", "check_limit"]
 
 _ZIP_ERRORS: Final = (
     OSError,
@@ -99,7 +99,7 @@ class SafeZip:
         limits: What is too large.
 
     Attributes:
-        path: As given.
+        path, limits: As given.
         files: zipfile's record of each file, by its place: a relative path with slashes, inside of
             the folder to which the archive is extracted.
         folders: The places of the folders that have an entry of their own.
@@ -110,7 +110,7 @@ class SafeZip:
     """
 
     def __init__(self, path: Path, limits: ArchiveLimits) -> None:
-        self.path = path
+        self.path, self.limits = path, limits
         self.files: dict[str, zipfile.ZipInfo] = {}
         self.folders: set[str] = set()
         self.notes: list[str] = []
@@ -123,16 +123,27 @@ class SafeZip:
             raise FMULoadError(
                 f"{path.name} is not an FMU (a zip archive): {reason(error)}"
             ) from None
-        _check_sizes(path, entries, limits)
+        self._check_sizes(entries)
         self._links: dict[str, zipfile.ZipInfo] = {}
         for entry in entries:
             self._add(entry)
         if self._links:
             self._follow_links()
-            _check_sizes(path, list(self.files.values()), limits)
+            self._check_sizes(self.files.values())
         self._check_folders()
 
     # Reading the directory
+
+    def _check_sizes(self, entries: Collection[zipfile.ZipInfo]) -> None:
+        """Compare the sizes that the directory gives; zipfile never unpacks more of a file."""
+        name, limits, count = self.path.name, self.limits, len(entries)
+        check_limit(f"{name} has {count} files", count, limits.max_entries, "max_entries")
+        size, most = sum(entry.file_size for entry in entries), limits.max_extracted_bytes
+        check_limit(f"{name} unpacks to {size} bytes", size, most, "max_extracted_bytes")
+        if size > _SMALL:
+            ratio = -(-size // self.path.stat().st_size)
+            found = f"{name} unpacks to {ratio} times its size"
+            check_limit(found, ratio, limits.max_ratio, "max_ratio")
 
     def _add(self, entry: zipfile.ZipInfo) -> None:
         place = self._place(entry)
@@ -215,12 +226,12 @@ class SafeZip:
 
         Some tools leave out the slash at the end of a folder's name. Such an entry is empty.
         """
-        for place in [*self.files, *(f"{folder}/" for folder in self.folders)]:
-            for folder in _folders_above(place):
-                entry = self.files.get(folder)
-                if entry is not None and entry.file_size:
-                    raise self._refusal(entry, "is a file, but other files lie inside of it")
-                self.files.pop(folder, None)
+        inside = [*self.files, *(f"{folder}/file" for folder in self.folders)]
+        above = [str(folder) for place in inside for folder in PurePosixPath(place).parents]
+        for folder in dict.fromkeys(above):
+            entry = self.files.pop(folder, None)
+            if entry is not None and entry.file_size:
+                raise self._refusal(entry, "is a file, but other files lie inside of it")
         self._check_case()
 
     def _check_case(self) -> None:
@@ -355,45 +366,27 @@ def _what_is_there(path: Path) -> str:
     return "" if near is None else f"; did you mean {near!r}?"
 
 
-def _check_sizes(path: Path, entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> None:
-    """Compare the sizes that the directory gives; zipfile never unpacks more of a file."""
-    _check_limit(path, "has {} files", len(entries), limits, "max_entries")
-    size = sum(entry.file_size for entry in entries)
-    _check_limit(path, "unpacks to {} bytes", size, limits, "max_extracted_bytes")
-    if size > _SMALL:
-        ratio = -(-size // path.stat().st_size)
-        _check_limit(path, "unpacks to {} times its size", ratio, limits, "max_ratio")
-
-
-def _check_limit(path: Path, what: str, value: int, limits: ArchiveLimits, name: str) -> None:
-    limit = getattr(limits, name)
-    if value > limit:
-        raise over_limit(f"{path.name} {what.format(value)}", limit, name)
-
-
-def over_limit(found: str, limit: int, name: str) -> FMULoadError:
-    """Make the error for what is too large.
+def check_limit(found: str, value: int, limit: int, name: str) -> None:
+    """Refuse what is too large.
 
     Args:
         found: What was found, with the name of the FMU.
+        value: How large it is.
         limit: The limit.
         name: The attribute of ``ArchiveLimits`` that sets the limit.
+
+    Raises:
+        FMULoadError: If the value is above the limit.
     """
-    return FMULoadError(
-        f"{found}, the limit is {limit}; if you trust it, raise {name} of ArchiveLimits"
-    )
+    if value > limit:
+        raise FMULoadError(
+            f"{found}, the limit is {limit}; if you trust it, raise {name} of ArchiveLimits"
+        )
 
 
 def _escapes(name: str) -> bool:
     """Whether a path is absolute, has a Windows drive, or climbs to a folder above."""
     return name.startswith("/") or name[1:2] == ":" or ".." in name.split("/")
-
-
-def _folders_above(place: str) -> Iterator[str]:
-    folder = place.rpartition("/")[0]
-    while folder:
-        yield folder
-        folder = folder.rpartition("/")[0]
 
 
 def _link_target(archive: zipfile.ZipFile, place: str, link: zipfile.ZipInfo) -> str:

@@ -23,9 +23,9 @@ __all__ = [
     "ask_for_texts",
     "number_of",
     "numbers_of",
-    "text_among",
     "text_of",
     "texts_of",
+    "values_by_name",
     "with_texts",
 ]
 
@@ -101,9 +101,14 @@ def ask_for_texts(find: Callable[[float], str | None], owner: object | None = No
     weakref.finalize(owner, _finders.pop, find_if_alive, None)
 
 
-def text_among(variable: Variable, number: float) -> str:
-    """The text of a String that a number stands for; see ``with_texts``."""
-    return next(text for text, own in variable.items if own == number)
+def values_by_name(
+    variables: Iterable[Variable], numbers: Iterable[float]
+) -> dict[str, float | str]:
+    """The values of variables by name, those of Strings as texts."""
+    return {
+        variable.name: text_of(number) if variable.kind == "string" else number
+        for variable, number in zip(variables, numbers, strict=True)
+    }
 
 
 def numbers_of(texts: Iterable[str | None]) -> npt.NDArray[np.float64]:

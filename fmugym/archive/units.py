@@ -13,7 +13,7 @@ from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 
-__all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
+__all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link"]
 
 _Value = TypeVar("_Value")
 """A number, or an object that calculates like one."""
@@ -118,14 +118,6 @@ def conversion_of_link(
     return _conversion_by_pint(source, source_units, target, target_units)
 
 
-def definition_of(name: str, units: Mapping[str, Unit]) -> Unit | None:
-    """Find what a name of a unit, or of a display unit, means in base units; None if it is open."""
-    for dimension, (factor, offset) in _defined(name, units):
-        if dimension is not None:
-            return Unit(dimension, factor, offset)
-    return None
-
-
 _LARGE: Final = 2.0**20
 """The factor is taken from a large difference, so that an offset costs it no digits."""
 
@@ -153,12 +145,13 @@ def _known(name: str, definitions: Mapping[str, Unit]) -> tuple[Any, Conversion]
     try:
         return _parsed(name), IDENTITY
     except ConfigError:
-        unit = definition_of(name, definitions)
-        if unit is None or unit.dimension is None:
+        known = ((powers, linear) for powers, linear in _defined(name, definitions) if powers)
+        found = next(known, None)
+        if found is None:
             raise
-    powers = zip(BASE_UNITS, unit.dimension, strict=True)
+    powers = zip(BASE_UNITS, found[0], strict=True)
     base = "*".join(f"{symbol}**({power})" for symbol, power in powers)
-    return _parsed(base), Conversion(unit.factor, unit.offset)
+    return _parsed(base), Conversion(*found[1])
 
 
 @cache

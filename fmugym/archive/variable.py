@@ -41,7 +41,8 @@ _KINDS = {
     "Clock": "boolean",
     "StartTime": "real",  # no type of FMI; see ``fmugym.pool.spec.START_TIME``
 }
-_INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
+_INTEGERS = {"Integer": "int32", "Enumeration": "int64"}
+"""The types that numpy calls otherwise."""
 
 
 _NO_LIMIT: Final = 1e30
@@ -307,18 +308,14 @@ class Variable:
         if self.name in sizes:
             return replace(self, start=str(sizes[self.name]))
         pairs = zip(self.dimensions, self.shape, strict=True) if self.dimensions else ()
-        shape = tuple(sizes.get(name, length) for name, length in pairs)
-        if not self.dimensions or shape == self.shape:
-            return self
-        return replace(self, shape=shape, start=None)
+        shape = tuple(sizes.get(name, length) for name, length in pairs) or self.shape
+        return self if shape == self.shape else replace(self, shape=shape, start=None)
 
     @property
     def integer_limits(self) -> tuple[int, int]:
         """The range of the C type of an integer or enumeration."""
-        if self.type.startswith("UInt"):
-            return 0, 2 ** int(self.type[4:]) - 1
-        bits = _INTEGER_BITS[self.type]
-        return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+        limits = np.iinfo(_INTEGERS.get(self.type, self.type.lower()))
+        return int(limits.min), int(limits.max)
 
 
 def checked_value(variable: Variable, value: Any) -> float:

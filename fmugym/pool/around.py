@@ -16,27 +16,27 @@ from fmugym.pool.form import form_of_listing, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import prepare
 
-__all__ = ["PlayAround"]
+__all__ = ["play_around", "programs_for"]
 
 
-class PlayAround:
-    """Runs programs before and after the steps of a pool.
+def play_around(pool: Pool, spec: PoolSpec, variables: tuple[Variable, ...], *parts: Any) -> Play:
+    """Prepare programs that run before and after the steps of a pool; see ``Pool.prepare_play``."""
+    programs = programs_for(pool, spec)
+    prepare(programs, _native.Access(form_of_listing(variables)), *parts)
+    return Play(programs.play_before, programs.play_after)
+
+
+def programs_for(pool: Pool, spec: PoolSpec) -> _native.Pool:
+    """Make a native pool of no FMU that runs programs on the arrays of another pool.
 
     Args:
         pool: Its arrays are those that programs read and write.
         spec: What the pool does at each step.
     """
-
-    def __init__(self, pool: Pool, spec: PoolSpec) -> None:
-        count = pool.num_instances
-        form = form_of_programs(spec, count, available_processors())
-        own = pool.inputs, pool.outputs, pool.statuses, pool.observations, no_counts(count)
-        self._pool = _native.Pool(form, own, _ignore)
-
-    def prepare(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
-        """See ``Pool.prepare_play``."""
-        prepare(self._pool, _native.Access(form_of_listing(variables)), *parts)
-        return Play(self._pool.play_before, self._pool.play_after)
+    count = pool.num_instances
+    form = form_of_programs(spec, count, available_processors())
+    own = pool.inputs, pool.outputs, pool.statuses, pool.observations, no_counts(count)
+    return _native.Pool(form, own, _ignore)
 
 
 def _ignore(index: int, status: int, category: str, message: str) -> None:

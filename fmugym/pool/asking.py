@@ -9,9 +9,9 @@ from typing import TypeVar
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.errors import SimulationError
-from fmugym.pool.base import FloatArray, naming
-from fmugym.pool.derivatives import Question, Variables, differentiated
+from fmugym.errors import SimulationError, first_of
+from fmugym.pool.base import FloatArray
+from fmugym.pool.derivatives import Variables, differentiated
 from fmugym.pool.form import Writer, table_of
 from fmugym.pool.requests import (
     Reader,
@@ -70,7 +70,9 @@ class AskingPool(SavingPool):
         try:
             return self._ask_for_values(doing, Request.READ, content, len(variables))
         except SimulationError as error:
-            raise SimulationError(naming(str(error), variables)) from None
+            names = first_of([variable.name for variable in variables])
+            text = str(error).replace(doing, f"reading {names}", 1)
+            raise SimulationError(text) from None
 
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """See ``Pool.write``."""
@@ -88,8 +90,9 @@ class AskingPool(SavingPool):
         about = description, spec, self.num_instances
         return differentiated(*about, self._differentiate, unknowns, knowns)
 
-    def _differentiate(self, question: Question) -> FloatArray:
-        adjoint, part, version, seeded, others = question
+    def _differentiate(
+        self, adjoint: bool, part: int, version: int, seeded: Variables, others: Variables
+    ) -> FloatArray:
         lists = request_listing(seeded, version), request_listing(others, version)
         content = Writer().integers(adjoint, part).forms(*lists).form()
         shape = len(seeded), len(others)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.errors import SimulationError, first_of
+from fmugym.errors import SimulationError
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
@@ -26,7 +26,6 @@ __all__ = [
     "PoolSpec",
     "StatusArray",
     "available_processors",
-    "naming",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -248,11 +247,15 @@ class Pool(ABC):
         """Whether ``roll_out`` does many steps of compiled hooks in one call."""
         return self.plays_alone
 
-    def prepare_play(self, *parts: Any) -> Play:
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """Prepare steps with compiled hooks.
 
         Args:
-            parts: As for ``NativePool.prepare_play``.
+            variables: As for ``reset``.
+            parts: As for ``fmugym.pool.native.prepare``.
+
+        Returns:
+            The functions that do the steps, and resets where the pool has one of its own.
 
         Raises:
             SimulationError: If the pool does not support it.
@@ -278,9 +281,3 @@ class Pool(ABC):
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """Return facts about the last step by name, each of shape (N,)."""
         return {}
-
-
-def naming(failure: str, variables: tuple[Variable, ...]) -> str:
-    """The words of a failure to read variables, with their names."""
-    names = first_of([variable.name for variable in variables])
-    return failure.replace("reading variables", f"reading {names}", 1)

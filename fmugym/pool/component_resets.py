@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from fmugym.archive.description import ModelDescription
@@ -46,9 +46,10 @@ def find_component_resets(
     Returns:
         A method for each component; empty if none can begin by a faster one than ``base``.
     """
-    slow = tuple(_at_least(base, own) for own in offers)
+    sure = _METHODS[_METHODS.index(base) :]
+    slow = tuple(next((one for one in own if one in sure), own[-1]) for own in offers)
     fast = tuple(own[0] for own in offers)
-    if all(map(_is_no_faster, fast, slow)):
+    if fast == slow:
         return ()
     if is_right(fast):
         return fast
@@ -58,35 +59,15 @@ def find_component_resets(
     return found if good else ()
 
 
-def _rank(method: ResetMethod) -> int:
-    return _METHODS.index(method)
-
-
-def _is_no_faster(one: ResetMethod, other: ResetMethod) -> bool:
-    return _rank(one) >= _rank(other)
-
-
-def _at_least(base: ResetMethod, offers: Sequence[ResetMethod]) -> ResetMethod:
-    """The fastest offered method that is as sure as the base."""
-    return next((own for own in offers if _is_no_faster(own, base)), offers[-1])
-
-
 def _fastest(
     slow: ComponentResets,
     index: int,
     offers: Sequence[ResetMethod],
     is_right: Callable[[ComponentResets], bool],
 ) -> ResetMethod:
-    for methods in _faster(slow, index, offers):
-        if is_right(methods):
-            return methods[index]
-    return slow[index]
-
-
-def _faster(
-    slow: ComponentResets, index: int, offers: Sequence[ResetMethod]
-) -> Iterator[ComponentResets]:
-    """Let one component begin by each of its faster methods, and the others as before."""
-    for method in offers:
-        if not _is_no_faster(method, slow[index]):
-            yield (*slow[:index], method, *slow[index + 1 :])
+    """The fastest method by which one component can begin while the others begin as before."""
+    return next(
+        method
+        for method in offers
+        if method is slow[index] or is_right((*slow[:index], method, *slow[index + 1 :]))
+    )

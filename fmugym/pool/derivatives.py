@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,31 +16,18 @@ from fmugym.pool.spec import PoolSpec
 from fmugym.systems.slots import Layout
 from fmugym.systems.system_description import SystemDescription
 
-__all__ = ["Question", "Variables", "differentiated"]
+__all__ = ["Variables", "differentiated"]
 
 Variables = tuple[Variable, ...]
 
 
-class Question(NamedTuple):
-    """What an engine differentiates; see ``native/derivatives.h``.
+Ask = Callable[[bool, int, int, Variables, Variables], FloatArray]
+"""Asks an engine to differentiate; see ``native/derivatives.h``.
 
-    Attributes:
-        adjoint: Whether the FMU differentiates unknowns by all knowns, not all unknowns by a known.
-        part: The component of a system; 0 for an FMU.
-        version: See ``fmugym.pool.form.table_of``.
-        seeded: The unknowns if it is adjoint, otherwise the knowns.
-        others: The others.
-    """
-
-    adjoint: bool
-    part: int
-    version: int
-    seeded: Variables
-    others: Variables
-
-
-Ask = Callable[[Question], FloatArray]
-"""Answers with an array of shape (seeded, others, N)."""
+The arguments are: whether the FMU differentiates unknowns by all knowns, not all unknowns by a
+known; the component of a system, 0 for an FMU; the version as of ``fmugym.pool.form.table_of``; the
+unknowns in the first case, otherwise the knowns; and the others. The result has the shape of these
+two, and N on the last axis."""
 
 
 def differentiated(
@@ -82,5 +68,5 @@ def _of_fmu(
         raise SimulationError(f"{description.model_name} provides no derivatives")
     adjoint = not capabilities.provides_directional_derivatives
     seeded, others = (unknowns, knowns) if adjoint else (knowns, unknowns)
-    found = ask(Question(adjoint, part, table_of(description), seeded, others))
+    found = ask(adjoint, part, table_of(description), seeded, others)
     return found if adjoint else found.swapaxes(0, 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import logging
 from collections.abc import Callable
 from types import CodeType
 from typing import Final, ParamSpec, TypeVar
@@ -13,10 +12,7 @@ __all__ = [
     "has_native_pool",
     "passes_refusals",
     "require_refusal",
-    "warn_of_slow_path",
 ]
-
-logger = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -35,12 +31,6 @@ def has_native_pool() -> bool:
     except ImportError:
         return False
     return True
-
-
-@functools.cache
-def warn_of_slow_path() -> None:
-    """Warn once per process that FMPy steps the FMUs."""
-    logger.warning("FMUs are stepped by FMPy, which is slow: %s", HOW_TO_BUILD)
 
 
 _passed: Final[set[CodeType]] = set()

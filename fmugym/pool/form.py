@@ -20,7 +20,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription
+from fmugym.archive.description import Capabilities, ModelDescription, ModelExchange
 from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of
 from fmugym.archive.variable import Variable, unlisted
@@ -37,6 +37,9 @@ from fmugym.systems.system_plan import Loop
 from fmugym.wine.installation import windows_path, windows_uri
 
 __all__ = [
+    "BLANK",
+    "INTEGER",
+    "NUMBER",
     "START_TIME_TYPE",
     "Files",
     "Writer",
@@ -75,18 +78,20 @@ START_TIME_TYPE: Final = 255
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
-_INTEGER, _NUMBER = struct.Struct("=q"), struct.Struct("=d")
+INTEGER, NUMBER = struct.Struct("=q"), struct.Struct("=d")
 _CLOCK: Final = struct.Struct("=IIdqqdqqq")
 _CLOCKED: Final = struct.Struct("=III")
 _NO_CLOCK: Final = 2**32 - 1
-_BLANK: Final = 8
+BLANK: Final = 8
 """Every item begins at a multiple of so many bytes."""
 
 _RESET_METHODS: Final = tuple(ResetMethod)
 """In the order of ``ResetMethod`` of ``native/system.h``."""
 
-_NO_FMU: Final = 2, 0
-"""Version and manner of functions that are never called."""
+_NO_FMU: Final = ModelDescription(
+    *("2.0", "", "", "", (), "", ""), *(0.0, None, None, None, None), Capabilities(), {}, {}, ()
+)
+"""Stands for an FMU whose functions are never called."""
 
 
 class Writer:
@@ -106,12 +111,12 @@ class Writer:
 
     def integers(self, *numbers: int) -> Self:
         """Write integers or flags."""
-        self._parts += [_INTEGER.pack(number) for number in numbers]
+        self._parts += [INTEGER.pack(number) for number in numbers]
         return self
 
     def numbers(self, *numbers: float) -> Self:
         """Write floating-point numbers."""
-        self._parts += [_NUMBER.pack(number) for number in numbers]
+        self._parts += [NUMBER.pack(number) for number in numbers]
         return self
 
     def optional(self, number: float | None) -> Self:
@@ -120,7 +125,7 @@ class Writer:
 
     def block(self, data: bytes) -> Self:
         """Write bytes with their size."""
-        self._parts += [_INTEGER.pack(len(data)), data, bytes(-len(data) % _BLANK)]
+        self._parts += [INTEGER.pack(len(data)), data, bytes(-len(data) % BLANK)]
         return self
 
     def array(self, values: Any, dtype: Any) -> Self:
@@ -156,14 +161,12 @@ def _texts(variables: Sequence[Variable]) -> bytes:
     """The texts that Strings may get, each with its number before it, by ascending numbers."""
     texts = {text for v in variables if v.kind == "string" for text, _ in v.items}
     return b"".join(
-        _NUMBER.pack(number_of(text)) + text.encode() + b"\0"
+        NUMBER.pack(number_of(text)) + text.encode() + b"\0"
         for text in sorted(texts, key=number_of)
     )
 
 
-def form_of_listing(
-    variables: Sequence[Variable], version: int = _NO_FMU[0], manner: int = _NO_FMU[1]
-) -> bytes:
+def form_of_listing(variables: Sequence[Variable], version: int = 2, manner: int = 0) -> bytes:
     """The form of a list of variables.
 
     Args:
@@ -225,7 +228,7 @@ class Files:
             paths: As the attribute.
         """
         return cls(
-            tuple(os.fsencode(path) for path in paths),
+            tuple(map(os.fsencode, paths)),
             tuple(
                 os.fsencode(os.path.join(place, "resources", ""))
                 if part.description.fmi_major_version == 3
@@ -301,20 +304,7 @@ def form_of_programs(spec: PoolSpec, count: int, threads: int) -> bytes:
         count: As for ``form_of_pool``.
         threads: As for ``form_of_pool``.
     """
-    writer = Writer()
-    writer.integers(_VERSION, *_NO_FMU)
-    for _ in range(3):
-        writer.text(b"")
-    writer.texts(())
-    for _ in range(2):
-        writer.block(b"")
-    writer.texts(())
-    writer.integers(False, False, False)
-    writer.integers(False)  # no solver
-    _write_experiment(writer, spec, False)
-    _write_variables(writer, spec, _NO_FMU[0])
-    writer.integers(count, threads)
-    return writer.form()
+    return form_of_pool(_NO_FMU, spec, Files((), (b"",)), count, threads)
 
 
 def _write_identity(writer: Writer, description: ModelDescription, resources: bytes) -> None:
@@ -336,23 +326,20 @@ def _write_solving(writer: Writer, description: ModelDescription, spec: PoolSpec
     writer.integers(solves)
     if not solves:
         return
-    tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
     if model is None:
-        writer.text(b"by_fmu")
-        writer.numbers(1.0, math.inf)
-        writer.integers(0, 0, False)
+        model = ModelExchange(0, 0, False)
+        writer.text(b"by_fmu").numbers(1.0, math.inf)
     else:
-        writer.text(spec.solver.encode())
-        writer.numbers(tolerance, spec.max_step or math.inf)
-        writer.integers(
-            model.number_of_states,
-            model.number_of_event_indicators,
-            model.needs_completed_integrator_step,
-        )
+        tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
+        writer.text(spec.solver.encode()).numbers(tolerance, spec.max_step or math.inf)
+    writer.integers(
+        model.number_of_states,
+        model.number_of_event_indicators,
+        model.needs_completed_integrator_step,
+    )
     differentiable = description.capabilities.provides_directional_derivatives
-    known = model if differentiable and model is not None else None
-    writer.array(() if known is None else known.state_references, np.uint32)
-    writer.array(() if known is None else known.derivative_references, np.uint32)
+    writer.array(model.state_references if differentiable else (), np.uint32)
+    writer.array(model.derivative_references if differentiable else (), np.uint32)
     for block in _clocks(description):
         writer.block(block)
 

@@ -1,24 +1,26 @@
-"""The counters of a pool for the work and the faults of each instance."""
+"""The arrays of a pool, with counters for the work and the faults of each instance."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.fmi.status import Status
-from fmugym.pool.base import Pool
+from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
 __all__ = [
     "HEALTH",
     "HEALTH_COUNTS",
+    "Arrays",
     "Column",
     "CountedPool",
     "HealthArray",
     "fault_rates",
+    "layout_of",
+    "new_arrays",
     "no_counts",
     "note",
 ]
@@ -63,6 +65,42 @@ def no_counts(num_instances: int) -> HealthArray:
     return np.zeros((num_instances, HEALTH_COUNTS), np.int64)
 
 
+class Arrays(NamedTuple):
+    """The arrays of a pool; see ``Pool``.
+
+    Attributes:
+        mask: Which instances not to step, shape (N,).
+        counts: What each instance does, shape (N, HEALTH_COUNTS).
+        progress: The steps of each episode in a rollout, shape (N,).
+    """
+
+    inputs: FloatArray
+    outputs: FloatArray
+    observations: npt.NDArray[np.float32]
+    statuses: StatusArray
+    mask: MaskArray
+    counts: HealthArray
+    progress: npt.NDArray[np.int64]
+
+
+def layout_of(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
+    """The shape and type of each of the arrays of N instances."""
+    return [
+        ((len(spec.inputs), count), np.float64),
+        ((len(spec.outputs), count), np.float64),
+        ((count, spec.num_observed), np.float32),
+        ((count,), np.int8),
+        ((count,), np.bool_),
+        ((count, HEALTH_COUNTS), np.int64),
+        ((count,), np.int64),
+    ]
+
+
+def new_arrays(spec: PoolSpec, count: int) -> Arrays:
+    """Make the arrays of N instances, all zero."""
+    return Arrays(*(np.zeros(*row) for row in layout_of(spec, count)))
+
+
 def note(counts: HealthArray, status: int) -> int:
     """Count a status for its instance if it is a fault; return the status."""
     if status > Status.WARNING:
@@ -75,11 +113,20 @@ def note(counts: HealthArray, status: int) -> int:
 class CountedPool(Pool):
     """A pool that counts what its instances do.
 
-    A subclass sets ``_spec``, and ``_counts`` of shape (N, HEALTH_COUNTS).
+    A subclass sets ``_spec``, and gets its arrays by ``_use``.
     """
 
     _spec: PoolSpec
     _counts: HealthArray
+
+    def _use(self, arrays: Arrays) -> None:
+        """Let these be the arrays of the pool."""
+        self.inputs, self.outputs, self.observations = arrays[:3]
+        self.statuses, self._counts = arrays.statuses, arrays.counts
+        self.num_instances = len(arrays.statuses)
+
+    def _as_mask(self, mask: MaskArray | None) -> MaskArray:
+        return np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask, np.bool_)
 
     @property
     def reset_method(self) -> ResetMethod:
@@ -118,7 +165,7 @@ class CountedPool(Pool):
 
 def fault_rates(health: dict[str, HealthArray]) -> npt.NDArray[np.float64]:
     """The share of each instance's episodes that ended with a fault, shape (N,)."""
-    kinds: Iterable[str] = ("discards", "errors", "fatals", "not_finite", "deaths")
-    faults = sum((health[kind] for kind in kinds), np.zeros_like(health["resets"]))
+    kinds = "discards", "errors", "fatals", "not_finite", "deaths"
+    faults = np.sum([health[kind] for kind in kinds], axis=0)
     rates: npt.NDArray[np.float64] = np.minimum(1.0, faults / np.maximum(1, health["resets"]))
     return rates

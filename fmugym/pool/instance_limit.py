@@ -5,12 +5,10 @@ Each environment that limits its instances claims all that it makes, and so does
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import threading
 import weakref
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,18 +16,18 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import LicenceError
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["Claim", "claim_instances", "claiming"]
+__all__ = ["claim_instances"]
 
 
 @dataclass(eq=False)
 class Claim:
-    """Instances of an FMU that count until this object is released or gone."""
+    """Instances of an FMU that count until this object is closed or gone."""
 
     content: str
     instances: int
     purpose: str
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Let others make instances; more than one call is fine."""
         _claims.discard(self)
 
@@ -54,7 +52,7 @@ def claim_instances(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Claim
         purpose: What for, for the messages that others get.
 
     Returns:
-        The claim; it need not be released if their number is not limited.
+        The claim; it need not be closed if their number is not limited.
 
     Raises:
         LicenceError: If there are not so many left; the text tells what the others are for.
@@ -85,13 +83,3 @@ def _refusal(name: str, most: int, count: int, purpose: str, taken: list[Claim])
         f"{name} needs {count} more instance(s) for {purpose}, but 'max_instances' of 'foreign' "
         f"allows {most} at once in this process, and of these are in use: {told}{advice}"
     )
-
-
-@contextlib.contextmanager
-def claiming(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Iterator[None]:
-    """Claim instances for this context, if they are limited; see ``claim_instances``."""
-    claim = claim_instances(fmu, spec, count, purpose)
-    try:
-        yield
-    finally:
-        claim.release()

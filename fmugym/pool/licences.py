@@ -13,15 +13,16 @@ import numpy as np
 
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import Pool
+from fmugym.pool.base import MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 
 __all__ = [
-    "LicenceWait",
     "licence_errors",
+    "refusals",
     "require_licence",
     "require_started",
     "speaks_of_licence",
+    "wait_for_licence",
 ]
 
 R = TypeVar("R")
@@ -75,10 +76,15 @@ def require_licence(pool: Pool) -> None:
     Raises:
         LicenceError: If one of them got no licence.
     """
-    for index in np.flatnonzero(pool.statuses > WARNING_CODE).tolist():
-        failure = pool.failure(index)
-        if speaks_of_licence(failure):
-            raise LicenceError(failure)
+    for failure in refusals(pool).values():
+        raise LicenceError(failure)
+
+
+def refusals(pool: Pool, chosen: MaskArray | bool = True) -> dict[int, str]:
+    """The texts of the instances among the chosen ones that got no licence, by their index."""
+    failed = np.flatnonzero(chosen & (pool.statuses > WARNING_CODE)).tolist()
+    texts = {index: pool.failure(index) for index in failed}
+    return {index: text for index, text in texts.items() if speaks_of_licence(text)}
 
 
 def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:
@@ -98,37 +104,31 @@ def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:
         raise error(failure if pool.num_instances == 1 else f"environment {index}: {failure}")
 
 
-class LicenceWait:
-    """How long to wait for a licence that was refused.
+def wait_for_licence(seconds: float, log: logging.Logger, function: Callable[[], R]) -> R:
+    """Call a function, again and again while it raises a ``LicenceError``.
 
     Args:
-        seconds: The real time in seconds; 0 to give up at once.
+        seconds: The real time in seconds to wait for a licence; 0 to give up at once.
         log: Is told of each refusal.
+        function: What to call.
+
+    Raises:
+        LicenceError: If the time is over. The text says how long this has waited.
     """
+    deadline, pause = time.monotonic() + seconds, _FIRST_PAUSE
+    while True:
+        try:
+            return function()
+        except LicenceError as error:
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                raise LicenceError(f"{error}; {_advice(seconds)}") from None
+            log.warning("%s; waiting for %.0f s more at most (licence_wait)", error, left)
+        time.sleep(min(pause, left))
+        pause = min(2.0 * pause, _LONGEST_PAUSE)
 
-    def __init__(self, seconds: float, log: logging.Logger) -> None:
-        self._seconds, self._log = seconds, log
 
-    def call(self, function: Callable[[], R]) -> R:
-        """Call a function, again and again while it raises a ``LicenceError``.
-
-        Raises:
-            LicenceError: If the time is over. The text says how long this has waited.
-        """
-        deadline, pause = time.monotonic() + self._seconds, _FIRST_PAUSE
-        while True:
-            try:
-                return function()
-            except LicenceError as error:
-                left = deadline - time.monotonic()
-                if left <= 0.0:
-                    raise LicenceError(f"{error}; {self._advice}") from None
-                self._log.warning("%s; waiting for %.0f s more at most (licence_wait)", error, left)
-            time.sleep(min(pause, left))
-            pause = min(2.0 * pause, _LONGEST_PAUSE)
-
-    @property
-    def _advice(self) -> str:
-        if self._seconds:
-            return f"no licence came within {self._seconds:g} s (licence_wait)"
-        return "'licence_wait' of the table 'foreign' gives the seconds to wait for a licence"
+def _advice(seconds: float) -> str:
+    if seconds:
+        return f"no licence came within {seconds:g} s (licence_wait)"
+    return "'licence_wait' of the table 'foreign' gives the seconds to wait for a licence"

@@ -6,7 +6,6 @@ import logging
 
 from fmugym.archive.fmu import FMU
 from fmugym.pool.licences import licence_errors
-from fmugym.pool.retrying import ResetRetry
 from fmugym.pool.saving_pool import SavingPool
 from fmugym.pool.spec import PoolSpec
 
@@ -47,5 +46,5 @@ def local_pool(
         threads=threads,
         private_libraries=private_libraries,
     )
-    pool.retry_by(ResetRetry.of(fmu.path.name, spec, log))
+    pool.retry_resets(fmu.path.name, log)
     return pool

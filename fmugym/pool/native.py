@@ -3,10 +3,8 @@
 Its results do not depend on the number of threads. Beyond the contract of ``Pool``, it offers the
 vector environment its internal arrays and calls without any conversion:
 
-* write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
-  ``pool.observations``;
-* ``pool.step_into`` and ``pool.reset_into`` write the observations to the caller's memory and
-  return how many instances had trouble; the caller reads the statuses only if there are any.
+write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
+``pool.observations``.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from fmugym.pool.base import (
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
-from fmugym.pool.health import no_counts
+from fmugym.pool.health import new_arrays
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.reports import Receiver, loading_failed
@@ -103,13 +101,8 @@ class NativePool(AskingPool):
         if private_libraries is None:
             once = capabilities.can_be_instantiated_only_once_per_process
             private_libraries = once and num_instances > 1
-        self.num_instances = num_instances
+        self._use(new_arrays(spec, num_instances))
         self.threads = available_processors() if threads is None else max(1, threads)
-        self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))
-        self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
-        self.statuses: StatusArray = np.zeros(num_instances, np.int8)
-        self.observations: FloatArray32 = np.zeros((num_instances, spec.num_observed), np.float32)
-        self._counts = no_counts(num_instances)
         self._result = self.outputs, self.statuses
         self._fmu, self._spec = fmu, spec
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
@@ -174,7 +167,11 @@ class NativePool(AskingPool):
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
-        self.step_into(None, skip, observations)
+        try:
+            self._pool.step(None, skip, observations)
+        except (TypeError, BufferError, ValueError) as error:
+            require_refusal(error)
+            self._open_pool().step(None, _as_mask(skip), observations)
         return self._result
 
     def save(self) -> _native.Snapshot:
@@ -272,108 +269,24 @@ class NativePool(AskingPool):
             raise SimulationError("the pool is closed")
         return self._pool
 
-    # The fast way.
-
-    def step_into(
-        self,
-        inputs: FloatArray | None = None,
-        skip: MaskArray | None = None,
-        observations: FloatArray32 | None = None,
-    ) -> int:
-        """Do one step as ``step`` does.
-
-        Args:
-            inputs: As for ``step``, but used in place and not copied to ``self.inputs``.
-            skip: As for ``step``.
-            observations: As for ``step``.
-
-        Returns:
-            How many of the instances that were stepped have a status worse than a warning.
-        """
-        try:
-            return self._pool.step(inputs, skip, observations)
-        except (TypeError, BufferError, ValueError) as error:
-            require_refusal(error)
-            pool = self._open_pool()
-            inputs = None if inputs is None else np.asarray(inputs, np.float64)
-            return pool.step(inputs, _as_mask(skip), observations)
-
-    def reset_into(
-        self,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray | None = None,
-        observations: FloatArray32 | None = None,
-    ) -> int:
-        """Start instances anew as ``reset`` does.
-
-        Args:
-            variables: As for ``reset``.
-            values: As for ``reset``.
-            mask: As for ``reset``.
-            observations: The rows of the instances in the mask are filled.
-
-        Returns:
-            How many of the instances in the mask have a status worse than a warning.
-        """
+    def _reset_some(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> None:
+        """See ``RetryingPool._reset_some``."""
         access = self._accesses.get(variables) or self._access(variables)
         try:
-            return self._reset(access, values, mask, observations)
+            self._reset(access, values, mask, None)
         except (TypeError, BufferError, ValueError) as error:
             require_refusal(error)
             self._open_pool()
-            values = np.asarray(values, np.float64)
-            return self._reset(access, values, _as_mask(mask), observations)
+            self._reset(access, np.asarray(values, np.float64), _as_mask(mask), None)
 
-    _reset_some = reset_into
+    # Steps with compiled hooks.
 
-    def prepare_play(
-        self,
-        variables: tuple[Variable, ...],
-        programs: tuple[tuple[Any, ...], tuple[Any, ...]],
-        actions: Mapping[str, Any],
-        start_values: FloatArray,
-        draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
-        episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-        surroundings: Mapping[str, Any],
-    ) -> Play:
-        """Prepare the pool for steps of a vector environment, hooks included.
-
-        This replaces what was prepared before. Every step uses the given arrays in place.
-
-        Args:
-            variables: As for ``reset``.
-            programs: From the actions to the inputs; from the outputs to done, truncated, reward.
-                See ``Program.with_rows``.
-            actions: How actions are checked and kept: the shape of one action; the letter of its
-                type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
-                from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
-                actions of this step and of the one before (or None), flat, environments first;
-                what counts as the action of a new episode.
-            start_values: As the values of ``reset``; the pool writes the draws there.
-            draws: The draws of an episode, and the random streams, shape (N, 6); see
-                ``EpisodeStreams``.
-            episodes: Steps of each episode, shape (N,); which environments start an episode in
-                the next step, shape (N,); steps after which an episode is truncated.
-            surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
-                the second program reads them; ``done``, for where the latest step has ended the
-                task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
-                they were before the step; ``drawn_variables``, rows and the numbers of their draws;
-                ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
-                each input the number of a start value, or -1 and a constant. ``results``, None if
-                only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
-                tuple; the forms of observations and of infos, each the number of an array, or a
-                tuple of names and forms; the shape and type of each array: float32 observations, or
-                those that the second program stores, then rewards, terminated and truncated of a
-                step, mask and drawn values (draws, N) of a reset; and a function of drawn values
-                and a mask, which returns what infos tell of the episodes that start.
-
-        Returns:
-            The functions that do the steps and the resets. The memory that resets allocate is added
-            to the growth counter.
-        """
-        start, pool = self._access(variables), self._pool
-        prepare(pool, start, programs, actions, start_values, draws, episodes, surroundings)
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
+        """See ``Pool.prepare_play``; the memory that resets allocate is added to the growth."""
+        pool = self._pool
+        prepare(pool, self._access(variables), *parts)
         step, reset = self._watched_play
         return Play(pool.play_before, pool.play_after, pool.play, step, reset)
 
@@ -395,9 +308,49 @@ class NativePool(AskingPool):
         return self._pool.step_one
 
 
-def prepare(pool: _native.Pool, start: _native.Access, *parts: Any) -> None:
-    """Do ``NativePool.prepare_play``, with the access to its variables."""
-    programs, actions, start_values, draws, (counts, ended, limit), surroundings = parts
+def prepare(
+    pool: _native.Pool,
+    start: _native.Access,
+    programs: tuple[tuple[Any, ...], tuple[Any, ...]],
+    actions: Mapping[str, Any],
+    start_values: FloatArray,
+    draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
+    episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
+    surroundings: Mapping[str, Any],
+) -> None:
+    """Prepare a pool for steps of a vector environment, hooks included.
+
+    This replaces what was prepared before. Every step uses the given arrays in place.
+
+    Args:
+        pool: The pool.
+        start: To the start variables, as for ``Pool.reset``.
+        programs: From the actions to the inputs; from the outputs to done, truncated, reward.
+            See ``Program.with_rows``.
+        actions: How actions are checked and kept: the shape of one action; the letter of its
+            type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
+            from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
+            actions of this step and of the one before (or None), flat, environments first;
+            what counts as the action of a new episode.
+        start_values: As the values of ``reset``; the pool writes the draws there.
+        draws: The draws of an episode, and the random streams, shape (N, 6); see
+            ``EpisodeStreams``.
+        episodes: Steps of each episode, shape (N,); which environments start an episode in
+            the next step, shape (N,); steps after which an episode is truncated.
+        surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
+            the second program reads them; ``done``, for where the latest step has ended the
+            task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
+            they were before the step; ``drawn_variables``, rows and the numbers of their draws;
+            ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
+            each input the number of a start value, or -1 and a constant. ``results``, None if
+            only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
+            tuple; the forms of observations and of infos, each the number of an array, or a
+            tuple of names and forms; the shape and type of each array: float32 observations, or
+            those that the second program stores, then rewards, terminated and truncated of a
+            step, mask and drawn values (draws, N) of a reset; and a function of drawn values
+            and a mask, which returns what infos tell of the episodes that start.
+    """
+    counts, ended, limit = episodes
     rows = Rows()
     pool.prepare_play(
         form=form_of_play(rows, programs, actions, limit, surroundings),

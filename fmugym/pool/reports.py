@@ -40,15 +40,16 @@ class Failure(NamedTuple):
     time: float
     reference: int
     said: str
-    values: bytes | None
-    part: str | None = None
+    has_values: bool
+    values: bytes
+    part: str
 
 
 def describe_failure(
     failure: Failure, description: ModelDescription, spec: PoolSpec, name: str
 ) -> str:
     """Say in a sentence why an instance of this name failed."""
-    if failure.values is not None:
+    if failure.has_values:
         variables = spec.inputs if "inputs" in failure.doing else spec.outputs
         return f"{failure.doing}: {_not_finite(variables, failure.values)}"
     text = _sentence(failure, description, name) + quoted(unpacked(failure.said))
@@ -65,7 +66,7 @@ def _sentence(failure: Failure, description: ModelDescription, name: str) -> str
         doing = f"{'setting' if is_string else doing} {name_of!r}"
     if failure.status < 0:  # the call was refused, and the text is a whole sentence
         return doing
-    return f"{name}: {failed_call(doing, failure.status, failure.part or '')}"
+    return f"{name}: {failed_call(doing, failure.status, failure.part)}"
 
 
 def _name_of(description: ModelDescription, reference: int, kind: str) -> str:

@@ -8,10 +8,9 @@ the worker.
 from __future__ import annotations
 
 import functools
-import struct
 from collections.abc import Callable, Sequence
 from enum import IntEnum
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +20,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
-from fmugym.pool.form import Writer
+from fmugym.pool.form import BLANK, INTEGER, NUMBER, Writer
 from fmugym.pool.reports import Failure, describe_failure
 from fmugym.pool.spec import PoolSpec
 
@@ -83,10 +82,6 @@ class DamagedError(Exception):
     """A worker has sent what is no answer."""
 
 
-_INTEGER, _NUMBER = struct.Struct("=q"), struct.Struct("=d")
-_BLANK: Final = 8
-
-
 class Reader:
     """Reads a form that a worker has sent.
 
@@ -98,7 +93,7 @@ class Reader:
 
     def _take(self, size: int) -> bytes:
         begin = self._place
-        end = begin + size + -size % _BLANK
+        end = begin + size + -size % BLANK
         if size < 0 or end > len(self._data):
             raise DamagedError("an answer ends too early")
         self._place = end
@@ -106,7 +101,7 @@ class Reader:
 
     def integer(self) -> int:
         """Read an integer."""
-        return int(_INTEGER.unpack(self._take(_INTEGER.size))[0])
+        return int(INTEGER.unpack(self._take(INTEGER.size))[0])
 
     def index(self, count: int) -> int:
         """Read an integer from 0 to below a count."""
@@ -117,7 +112,7 @@ class Reader:
 
     def number(self) -> float:
         """Read a floating-point number."""
-        return float(_NUMBER.unpack(self._take(_NUMBER.size))[0])
+        return float(NUMBER.unpack(self._take(NUMBER.size))[0])
 
     def block(self) -> bytes:
         """Read bytes with their size."""
@@ -140,7 +135,7 @@ class Reader:
 
     def blocks(self, count: int) -> list[bytes]:
         """Read so many blocks."""
-        return [self._take(_INTEGER.unpack(self._take(_BLANK))[0]) for _ in range(count)]
+        return [self._take(INTEGER.unpack(self._take(BLANK))[0]) for _ in range(count)]
 
     def end(self) -> None:
         """Require that nothing follows."""
@@ -183,13 +178,18 @@ class Answers:
         """Read why an instance has failed, counted within the block; "" if it has not."""
         if not reader.integer():
             return ""
-        doing, in_warm_up, status = reader.text(), bool(reader.integer()), reader.integer()
-        time, reference, said = reader.number(), reader.integer(), reader.text()
-        has_values, values, part = bool(reader.integer()), reader.block(), reader.text()
-        reader.end()
         failure = Failure(
-            doing, in_warm_up, status, time, reference, said, values if has_values else None, part
+            doing=reader.text(),
+            in_warm_up=bool(reader.integer()),
+            status=reader.integer(),
+            time=reader.number(),
+            reference=reader.integer(),
+            said=reader.text(),
+            has_values=bool(reader.integer()),
+            values=reader.block(),
+            part=reader.text(),
         )
+        reader.end()
         name = f"{self._description.model_identifier}_{self._block.start + index}"
         try:
             return describe_failure(failure, self._description, self._spec, name)

@@ -12,89 +12,24 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import LicenceError
-from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import CountedPool
-from fmugym.pool.licences import LicenceWait, speaks_of_licence
+from fmugym.pool.licences import refusals, wait_for_licence
 from fmugym.pool.progress import progress
-from fmugym.pool.spec import PoolSpec
 
-__all__ = ["ResetRetry", "RetryingPool"]
-
-Reset = Callable[[tuple[Variable, ...], FloatArray, MaskArray | None], Any]
-"""A pool's own function for resets, which tries once."""
-
-
-class ResetRetry:
-    """Tries resets again while licences are refused, and tells what takes long.
-
-    Args:
-        name: The FMU, for messages.
-        spec: Says how long to wait for a licence.
-        log: Is told what this waits for.
-    """
-
-    def __init__(self, name: str, spec: PoolSpec, log: logging.Logger) -> None:
-        self._name, self._log = name, log
-        self._wait = LicenceWait(spec.licence_wait, log)
-
-    @classmethod
-    def of(cls, name: str, spec: PoolSpec, log: logging.Logger) -> ResetRetry | None:
-        """Make one; None if a pool neither waits for licences nor tells of slow resets."""
-        needed = spec.licence_wait or log.isEnabledFor(logging.INFO)
-        return cls(name, spec, log) if needed else None
-
-    def reset(
-        self,
-        pool: RetryingPool,
-        reset: Reset,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray | None,
-    ) -> None:
-        """Reset instances; those that get no licence are reset again.
-
-        Args:
-            pool: The pool.
-            reset: Its function for resets.
-            variables: As for ``Pool.reset``.
-            values: As for ``Pool.reset``.
-            mask: As for ``Pool.reset``.
-        """
-        chosen = np.ones(pool.num_instances, np.bool_) if mask is None else np.asarray(mask)
-        what = f"{self._name}: the initialization of {np.count_nonzero(chosen)} instance(s)"
-
-        def attempt() -> None:
-            nonlocal chosen
-            with progress(self._log, what):
-                reset(variables, values, chosen)
-            refused = _refusals(pool, chosen)
-            if refused:
-                chosen = np.isin(np.arange(pool.num_instances), list(refused))
-                raise LicenceError(next(iter(refused.values())))
-
-        with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
-            self._wait.call(attempt)
-
-
-def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
-    """The texts of the instances among the chosen ones that got no licence."""
-    failed = np.flatnonzero(chosen & (pool.statuses > WARNING_CODE)).tolist()
-    texts = {index: pool.failure(index) for index in failed}
-    return {index: text for index, text in texts.items() if speaks_of_licence(text)}
+__all__ = ["RetryingPool"]
 
 
 class RetryingPool(CountedPool):
-    """A pool whose resets may be tried again."""
+    """A pool whose resets may be tried again while licences are refused."""
 
-    _retry: ResetRetry | None = None
+    _told: tuple[str, logging.Logger] | None = None
+    _release: Callable[[], None] | None = None
 
     @property
     def retries_resets(self) -> bool:
         """See ``Pool.retries_resets``."""
-        return self._retry is not None
-
-    _release: Callable[[], None] | None = None
+        return self._told is not None
 
     def hold(self, release: Callable[[], None]) -> None:
         """Keep the claim of the instances until ``close``, which releases it."""
@@ -104,18 +39,26 @@ class RetryingPool(CountedPool):
         if self._release is not None:
             self._release()
 
-    def retry_by(self, retry: ResetRetry | None) -> None:
-        """Let all calls of ``reset`` be tried again from now on; None for one try."""
-        self._retry = retry
+    def retry_resets(self, name: str, log: logging.Logger) -> None:
+        """From now on, try resets again while licences are refused, and tell what takes long.
+
+        Nothing changes if the pool neither waits for licences nor tells of slow resets.
+
+        Args:
+            name: The FMU, for messages.
+            log: Is told what this waits for.
+        """
+        if self._spec.licence_wait or log.isEnabledFor(logging.INFO):
+            self._told = name, log
 
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        if self._retry is None:
+        if self._told is None:
             self._reset_some(variables, values, mask)
         else:
-            self._retry.reset(self, self._reset_some, variables, values, mask)
+            self._reset_patiently(*self._told, variables, values, mask)
         return self.outputs, self.statuses
 
     @abstractmethod
@@ -123,3 +66,27 @@ class RetryingPool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> Any:
         """Do what ``reset`` does, once."""
+
+    def _reset_patiently(
+        self,
+        name: str,
+        log: logging.Logger,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        mask: MaskArray | None,
+    ) -> None:
+        """Reset instances; those that get no licence are reset again."""
+        chosen = self._as_mask(mask)
+        what = f"{name}: the initialization of {np.count_nonzero(chosen)} instance(s)"
+
+        def attempt() -> None:
+            nonlocal chosen
+            with progress(log, what):
+                self._reset_some(variables, values, chosen)
+            refused = refusals(self, chosen)
+            if refused:
+                chosen = np.isin(np.arange(self.num_instances), list(refused))
+                raise LicenceError(next(iter(refused.values())))
+
+        with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
+            wait_for_licence(self._spec.licence_wait, log, attempt)

@@ -18,7 +18,6 @@ __all__ = [
     "FIXED_STEP_SOLVERS",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
-    "REUSING",
     "SAMPLINGS",
     "SOLVERS",
     "START_TIME",

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMULoadError, unknown_name
+from fmugym.checks import check_option
+from fmugym.errors import FMULoadError
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, ResetMethod
 from fmugym.wine.prefix import Wine
 
@@ -51,10 +52,10 @@ class Wishes:
             FMULoadError: If the FMU can only run in Wine, and that is not there, or a wish cannot
                 be granted there.
         """
-        if self.isolation not in (None, *ISOLATIONS):
-            raise unknown_name("isolation", self.isolation, ISOLATIONS)
-        if self.reset_method not in (None, *ResetMethod):
-            raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
+        if self.isolation is not None:
+            check_option("isolation", self.isolation, ISOLATIONS)
+        if self.reset_method is not None:
+            check_option("reset method", self.reset_method, map(str, ResetMethod))
         if fmu.in_wine:
             self._prepare_wine(fmu)
             return replace(self, threads=1, private_libraries=None, isolation="process")
@@ -69,16 +70,12 @@ class Wishes:
             "preload": fmu.preload,
         }
         refused = [wish for wish, is_given in wishes.items() if is_given]
-        try:
-            if refused:
-                raise FMULoadError(
-                    f"{fmu.path.name} has libraries for Windows only, which run here in worker "
-                    f"processes in Wine, but this leaves no choice for: {', '.join(refused)}"
-                )
-            Wine.ready()
-        except BaseException:
-            fmu.close()
-            raise
+        if refused:
+            raise FMULoadError(
+                f"{fmu.path.name} has libraries for Windows only, which run here in worker "
+                f"processes in Wine, but this leaves no choice for: {', '.join(refused)}"
+            )
+        Wine.ready()
 
     @property
     def decides_who_shares(self) -> bool:

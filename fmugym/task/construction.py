@@ -179,10 +179,10 @@ class Constructed(Pictured):
         def present() -> Any:
             return self.inside.readings.values
 
-        out = NamedTexts(names, strings, present) if strings else None
+        texts = NamedTexts(names, strings, present)
         return Readings(
             values=values,
-            out=NamedValues("output", names, present) if out is None else out,
+            out=texts if strings else NamedValues("output", names, present),
             state=state,
             previous_state=state,
             inputs=tuple(start for _, start in self.inside.start_inputs),

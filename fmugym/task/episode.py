@@ -95,8 +95,7 @@ class EpisodeDraws:
             for variable, (name, value) in zip(model_variables, parameters.items(), strict=True)
         ]
         self.constants = np.array(constants, np.float64)
-        strings = (v.name for v in model_variables if v.kind == "string")
-        self.strings = frozenset(strings)
+        self.strings = frozenset(v.name for v in model_variables if v.kind == "string")
         self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
         self._variables.update((name, array.constants) for name, array in self._arrays.items())
         self._random_variables = {
@@ -165,14 +164,13 @@ class EpisodeDraws:
     @property
     def recipes(self) -> list[Recipe] | None:
         """The draws for the C extension; None if only Python can draw them."""
-        recipes = []
-        variables: list[Any] = [self.model_variables[i] for i in self._random_parameters.values()]
-        variables += [None] * (len(self.drawn) - len(variables))
-        for draw_, one, variable in zip(self.drawn, self._distributions, variables, strict=True):
-            if variable is None:
-                recipes.append(recipe_of(one, partial(check_number, draw_.name)))
-            else:
-                recipes.append(_recipe_of(one, variable))
+        rows = zip(self.drawn, self._distributions, self.drawn_rows, strict=True)
+        recipes = [
+            recipe_of(one, partial(check_number, draw_.name))
+            if row < 0
+            else _recipe_of(one, self.model_variables[row])
+            for draw_, one, row in rows
+        ]
         known = [recipe for recipe in recipes if recipe is not None]
         return together(self._distributions, known) if len(known) == len(recipes) else None
 

@@ -125,13 +125,16 @@ def assumed(
     Yields:
         The tables by the bytes of those whose place they take.
     """
-    found = [one.lookups[name] for one in futures if one is not None for name in tables]
-    own = [one.table for one in found]
-    others = [*tables.values()] * (len(found) // max(1, len(tables)))
-    for lookup, table in zip(found, others, strict=True):
+    changes = [
+        (one.lookups[name], one.lookups[name].table, table)
+        for one in futures
+        if one is not None
+        for name, table in tables.items()
+    ]
+    for lookup, _, table in changes:
         lookup.tables[lookup.key] = table
     try:
-        yield {mine.tobytes(): other for mine, other in zip(own, others, strict=True)}
+        yield {own.tobytes(): table for _, own, table in changes}
     finally:
-        for lookup, table in zip(found, own, strict=True):
-            lookup.tables[lookup.key] = table
+        for lookup, own, _ in changes:
+            lookup.tables[lookup.key] = own

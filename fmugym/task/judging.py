@@ -17,7 +17,6 @@ __all__ = [
     "Result",
     "after_step",
     "first_observation",
-    "info_of",
     "judged",
     "not_finite",
 ]

@@ -74,20 +74,20 @@ def open_fmu(
         ConfigError: If an argument is invalid.
         FMULoadError: If the file is missing or not a valid FMU.
     """
+    limits, timeout = config.foreign.archive_limits, config.foreign.probe_timeout
     if isinstance(path, FMUSystem):
-        return _shared((path, config.foreign.probe_timeout), lambda: _open_system(path, config))
+        return _shared((path, timeout), lambda: _open_system(path, config))
     file = _find_file(cls, check_path("fmu_path", path))
     if file.suffix.lower() == ".ssp":
-        key = file, repr(config.foreign.archive_limits), config.foreign.probe_timeout
-        limits = config.foreign.archive_limits
+        key = file, repr(limits), timeout
         return _shared(key, lambda: _open_system(FMUSystem.read(file, limits), config))
     preload = [
         _find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.foreign.preload
     ]
     arguments: dict[str, Any] = {
-        "limits": config.foreign.archive_limits,
+        "limits": limits,
         "preload": preload,
-        "probe_timeout": config.foreign.probe_timeout,
+        "probe_timeout": timeout,
         "interface": _interface_of(cls, config.interface, interface),
     }
     fmu = _shared((file, repr(arguments)), lambda: FMU(file, **arguments))
@@ -170,7 +170,6 @@ class PoolOpening:
         """
         most = self.config.foreign.max_instances
         if most is not None and num_instances > most:
-            self.fmu.close()
             raise ConfigError(
                 f"{self.fmu.path.name}: {num_instances} environments need {num_instances} "
                 f"instances, but 'max_instances' of 'foreign' allows {most}"

@@ -108,10 +108,8 @@ def finiteness_of(space: spaces.Space[Any]) -> Finiteness:
         return _of_short_arrays(space, checked) if are_short else checked
     if isinstance(space, spaces.Tuple):
         return _of_tuple([finiteness_of(inner) for inner in space.spaces])
-    if isinstance(space, spaces.Box) and space.dtype.kind == "f":
-        return _of_floats(space)
     if isinstance(space, spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete):
-        return _of_integers(space)
+        return _of_numbers(space)
     return _of_others(space)
 
 
@@ -121,29 +119,24 @@ def _is_short(space: spaces.Space[Any]) -> bool:
     return len(space.shape) == 1 and space.shape[0] <= _FEW
 
 
-def _of_floats(space: spaces.Box) -> Finiteness:
+def _of_numbers(space: Any) -> Finiteness:
     shape, dtype = space.shape, space.dtype
-    is_short = _is_short(space)
+    is_short, is_float = _is_short(space), dtype.kind == "f"
 
     def is_finite(observation: Any) -> bool:
         if type(observation) is not np.ndarray or observation.dtype is not dtype:
-            with np.errstate(over="ignore", invalid="ignore"):
-                observation = _numbers(observation, "fiub").astype(dtype)
+            observation = _numbers(observation)
+            if is_float:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    observation = observation.astype(dtype)
         if observation.shape != shape:
-            _refuse_shape(observation, shape)
+            raise ConfigError(
+                f"{_OBSERVE} returned an array of shape {observation.shape}, but the observation "
+                f"space has {shape}"
+            )
         if is_short and isfinite(hypot(*observation.tolist())):
             return True
-        return bool(np.isfinite(observation).all())
-
-    return is_finite
-
-
-def _of_integers(space: Any) -> Finiteness:
-    def is_finite(observation: Any) -> bool:
-        array = _numbers(observation, "iubf")
-        if array.shape != space.shape:
-            _refuse_shape(array, space.shape)
-        return array.dtype.kind != "f" or bool(np.isfinite(array).all())
+        return observation.dtype.kind != "f" or bool(np.isfinite(observation).all())
 
     return is_finite
 
@@ -203,19 +196,12 @@ def _of_others(space: spaces.Space[Any]) -> Finiteness:
     return is_finite
 
 
-def _numbers(observation: Any, kinds: str) -> np.ndarray[Any, Any]:
+def _numbers(observation: Any) -> np.ndarray[Any, Any]:
     given(observation, _OBSERVE)
     try:
         array = np.asarray(observation)
     except ordinary(Exception):  # ragged lists, or objects whose methods fail
         array = np.asarray(None)
-    if array.dtype.kind not in kinds:
+    if array.dtype.kind not in "fiub":
         raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, expected an array of numbers")
     return array
-
-
-def _refuse_shape(array: np.ndarray[Any, Any], shape: tuple[int, ...] | None) -> None:
-    raise ConfigError(
-        f"{_OBSERVE} returned an array of shape {array.shape}, but the observation space has "
-        f"{shape}"
-    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
@@ -113,6 +114,9 @@ class WarmUps:
         self._env, self.warm_up = env, warm_up
         starts = env.config.episode_variables
         self._shapes = {name: np.shape(starts[name]) for name in warm_up.writes}
+        sizes = len(env.inside.interface.inputs), *map(math.prod, self._shapes.values())
+        self._ends = np.cumsum(sizes)
+        self._size = 8 * int(self._ends[-1])  # of the bytes before an FMU's state
         self._prefix: str | None = None
         self._scope = b""
         self._keys: dict[int, bytes] = {}
@@ -197,23 +201,13 @@ class WarmUps:
         return [(self._restored(pool, *pair), pair[1]) for pair in pairs]
 
     def _restored(self, pool: Pool, warmed: bytes, indices: IndexArray) -> dict[str, Any]:
-        size, ends = self._size_of_numbers, np.cumsum([len(pool.inputs), *self._sizes])
-        inputs, *parts = np.split(np.frombuffer(warmed[:size]), ends[:-1])
-        bundle, sources = Bundle((warmed[size:],)), np.zeros(len(indices), np.int64)
+        inputs, *parts = np.split(np.frombuffer(warmed[: self._size]), self._ends[:-1])
+        bundle, sources = Bundle((warmed[self._size :],)), np.zeros(len(indices), np.int64)
         pool.restore_instances(bundle, sources, indices)
         require_started(pool, indices, _FAILED)
         pool.inputs[:, indices] = inputs[:, None]
         shapes = self._shapes.items()
         return {name: p.reshape(*n, 1) for (name, n), p in zip(shapes, parts, strict=True)}
-
-    @property
-    def _sizes(self) -> list[int]:
-        return [int(np.prod(shape)) for shape in self._shapes.values()]
-
-    @property
-    def _size_of_numbers(self) -> int:
-        """How many bytes stand before the FMU's state."""
-        return 8 * (len(self._env.inside.interface.inputs) + sum(self._sizes))
 
     # Warm-ups
 
@@ -275,7 +269,7 @@ class WarmUps:
     def _read(self, key: bytes) -> bytes | None:
         """Find a state on disk."""
         found = StateFiles(self._prefix).find(key.hex()[:32]) if self._prefix else None
-        if found is None or len(found) <= self._size_of_numbers:
+        if found is None or len(found) <= self._size:
             return None
         _memory.keep(key, found)
         return found

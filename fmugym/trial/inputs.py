@@ -52,14 +52,11 @@ def moving_inputs(spec: PoolSpec, steps: int, amplitude: float, phase: float = 0
     return rows
 
 
-def _start(variable: Variable) -> float:
-    (low, high), start = variable.range, variable.start_number
-    return min(max(start, low), high) if low <= high else start
-
-
 def _moved(variable: Variable, swing: FloatArray) -> FloatArray:
     """Values around the start value that swing up to the upper limit and down to the lower one."""
-    (low, high), start = variable.range, _start(variable)
+    (low, high), start = variable.range, variable.start_number
+    if low <= high:
+        start = min(max(start, low), high)
     if variable.kind == "boolean":
         return np.where(swing > 0.3, 1.0 - start, start)
     if variable.items:

@@ -17,7 +17,7 @@ import fmpy
 
 from fmugym.archive.fmu import FMU
 from fmugym.caching import cache_folder, read_file, replace_file
-from fmugym.errors import unknown_name
+from fmugym.checks import check_option
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import PoolSpec
 from fmugym.signals import ordinary
@@ -115,9 +115,8 @@ def is_exempt(fmu: FMU) -> bool:
 
 def _trials_are_off() -> bool:
     given = os.environ.get("FMUGYM_PROBE", "").strip().lower()
-    if given not in (*_ON, *_OFF, ""):
-        known = (*_ON, *_OFF)
-        raise unknown_name("value of the environment variable FMUGYM_PROBE", given, known)
+    if given:
+        check_option("value of the environment variable FMUGYM_PROBE", given, (*_ON, *_OFF))
     return given in _OFF
 
 

@@ -12,11 +12,10 @@ from fmugym.pool.backend.backend_choice import pool_of_backend
 from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.instance_limit import claim_instances
-from fmugym.pool.licences import LicenceWait, licence_errors
+from fmugym.pool.licences import licence_errors, wait_for_licence
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
-from fmugym.pool.retrying import ResetRetry
 from fmugym.pool.saving_pool import SavingPool, offered_method
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.wishes import Wishes
@@ -65,7 +64,7 @@ def make_pool(
     def attempt() -> Pool:
         return _open(_made(wishing, starts, spare=spare), log)
 
-    return LicenceWait(spec.licence_wait, log).call(attempt)
+    return wait_for_licence(spec.licence_wait, log, attempt)
 
 
 def _made(plan: Plan, starts: Starts | None, *, spare: bool) -> Plan:
@@ -106,9 +105,9 @@ def _open(plan: Plan, log: logging.Logger) -> SavingPool:
         with progress(log, f"{fmu.path.name}: the instantiation of {count} instance(s)"):
             pool = _pool(plan, log)
     except BaseException:
-        claim.release()
+        claim.close()
         raise
-    pool.hold(claim.release)
+    pool.hold(claim.close)
     pool.save_by(plan.save_by)
     return pool
 
@@ -125,5 +124,5 @@ def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
         own_files=plan.own_files,
         call_timeout=how.call_timeout,
     )
-    pool.retry_by(ResetRetry.of(plan.fmu.path.name, plan.spec, log))
+    pool.retry_resets(plan.fmu.path.name, log)
     return pool

@@ -98,7 +98,6 @@ class Plan:
 
     def _with_neighbours(self, neighbours: Neighbours) -> Plan:
         """Keep instances from disturbing each other, unless the caller insists."""
-        insists = self.how.isolation == "none"
         why = f"the instances of {self._name} disturb each other"
         kept = "isolation='none' keeps them in one process all the same"
         if is_alone(self.fmu):
@@ -117,7 +116,7 @@ class Plan:
             plan, what = self._with(threads=1), "all are stepped by one thread"
         elif neighbours is Neighbours.LIBRARIES and not self.is_isolated:
             plan, what = self._with(private_libraries=True), "each gets a copy of the library"
-        elif insists:
+        elif self.how.isolation == "none":
             plan, what = self, kept
         else:
             workers = self.how.workers or self.num_instances

@@ -8,6 +8,7 @@ states may hold addresses of the first process, so the second one may crash.
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -19,7 +20,7 @@ from fmugym.errors import LicenceError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.bundle import Bundle, SaveMethod
-from fmugym.pool.instance_limit import claiming
+from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.known import known_resuming, note_resuming
@@ -84,7 +85,7 @@ def method_that_works(fmu: FMU, spec: PoolSpec, starts: Starts | None) -> SaveMe
     if known is not None:
         return known
     try:
-        with claiming(fmu, spec, 1, "a trial of saved states"):
+        with closing(claim_instances(fmu, spec, 1, "a trial of saved states")):
             method, grade = _tried(Subject(fmu), spec, starts or Starts())
     except LicenceError as error:
         logger.warning("snapshots keep the inputs of the episode for now: %s", error)

@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final, TypeVar
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
@@ -275,14 +276,12 @@ class TriedPool(ProcessPool):
         num_instances: int,
         **options: Any,
     ) -> None:
-        self.fmu, self._about = fmu, (subject, stage)
+        self.fmu = fmu
         options = {"workers": 1, "threads": 1, "on_trial": True} | options
         options["call_timeout"] = subject.call_timeout(OPENING)
         options["closing_time"], _ = subject.limit(CLOSING)
+        options["make_group"] = partial(_TriedGroup, subject, stage)
         super().__init__(fmu, spec, num_instances, _SILENT, **options)
-
-    def _grouped(self, *arguments: Any) -> _TriedGroup:
-        return _TriedGroup(*self._about, *arguments)
 
     def require_survival(self) -> None:
         """Raise a ``DeathError`` if the process has not survived until its end."""

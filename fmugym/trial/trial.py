@@ -11,14 +11,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.pool.component_resets import find_component_resets, offers_of
-from fmugym.pool.instance_limit import claiming
+from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.supervisor import WorkerError
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -69,7 +69,7 @@ def examine(
         return with_harm(known, fmu)
     subject = Subject(fmu)
     rehearsal = Rehearsal(subject, spec, starts or Starts())
-    with claiming(fmu, spec, 2 if several else 1, "a trial"), _naming(subject):
+    with closing(claim_instances(fmu, spec, 2 if several else 1, "a trial")), _naming(subject):
         verdict = _of_one(rehearsal, known or Verdict(), must_survive=must_survive)
         if several and verdict.complete:
             verdict = replace(verdict, neighbours=need_of_several(rehearsal, verdict))
@@ -114,7 +114,7 @@ def compare(fmu: FMU, spec: PoolSpec, starts: Starts | None = None) -> Verdict:
         return need_in_turn(rehearsal, ResetMethod.INSTANCE)
 
     unknown = Neighbours.INDEPENDENT
-    with claiming(fmu, spec, 2, "a trial"), _naming(subject):
+    with closing(claim_instances(fmu, spec, 2, "a trial")), _naming(subject):
         found = Verdict(neighbours=subject.attempt(need, refused=unknown, died=unknown))
     remember(key, found.to_text())
     return found

@@ -20,11 +20,11 @@ def count(threads, n, work, rest, rounds):
     pool.reset((), np.zeros((0, n)))
     inputs = np.full((1, n), float(work))
     for _ in range(20):  # until the cost is known, and all helpers are there
-        pool.step_into(inputs)
+        pool.step(inputs)
     before = _native.statistics()
     for _ in range(rounds):
         time.sleep(rest / 1e3)  # helpers go to sleep
-        pool.step_into(inputs)
+        pool.step(inputs)
     after = _native.statistics()
     pool.close()
     return {name: after[name] - before[name] for name in after}
@@ -117,7 +117,7 @@ def test_results_do_not_depend_on_where_ranges_begin(tmp_path):
         pool = make(NativePool, path, ["work"], ["steps"], n, threads=4)
         pool.reset((), np.zeros((0, n)))
         for number in range(1, 6):
-            pool.step_into(np.full((1, n), 30.0 if n < 200 else 1.0))
+            pool.step(np.full((1, n), 30.0 if n < 200 else 1.0))
             assert (pool.outputs == number).all()
         pool.close()
 

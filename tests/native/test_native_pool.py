@@ -197,7 +197,7 @@ class TestFastWay:
     def test_arguments_are_used_where_they_are(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 5)
         pool.reset((), np.zeros((0, 5)))
-        assert pool.step_into(np.ones((1, 5))) == 0
+        assert pool._pool.step(np.ones((1, 5)), None, None) == 0
         assert not pool.inputs.any()
 
     def test_trouble_is_counted(self, native, probe):
@@ -205,16 +205,18 @@ class TestFastWay:
         names = ("fault", "fault_step")
         values = np.array([[0, 3, 6, 7], [1, 1, 1, 1]], float)
         variables = tuple(map(pool.variable, names))
-        assert pool.reset_into(variables, values) == 0
-        assert pool.step_into(pool.inputs, np.array([False, False, False, True])) == 2
-        assert pool.step_into(pool.inputs) == 3  # those that have ended and the one skipped before
+        access = pool._access(variables)
+        assert pool._pool.reset(access, values, None, None) == 0
+        assert pool._pool.step(None, np.array([False, False, False, True]), None) == 2
+        assert pool.step_own() == 3  # those that have ended and the one skipped before
 
     def test_observations_of_a_reset(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x", "theta"], 4)
         observations = np.full((4, 2), 9, np.float32)
         mask = np.array([True, False, True, False])
         values = np.full((1, 4), 1.5)
-        pool.reset_into((pool.variable("theta_0"),), values, mask, observations)
+        access = pool._access((pool.variable("theta_0"),))
+        pool._pool.reset(access, values, mask, observations)
         assert observations.tolist() == [[0, 1.5], [9, 9], [0, 1.5], [9, 9]]
 
 
@@ -229,7 +231,7 @@ class TestArguments:
         np.testing.assert_array_equal(pool.outputs, other.outputs)
         pool.reset(theta[0], np.broadcast_to(np.float32(1.5), (1, 6)), [1, 1, 1, 0, 0, 0])
         other.reset(theta[1], np.full((1, 6), 1.5), np.array([True] * 3 + [False] * 3))
-        pool.step_into(np.arange(6)[None, ::-1], [False] * 6)
+        pool.step(np.arange(6)[None, ::-1], [False] * 6)
         other.step(np.arange(6.0)[None, ::-1])
         np.testing.assert_array_equal(pool.outputs, other.outputs)
 
@@ -237,7 +239,7 @@ class TestArguments:
     def test_shapes(self, native, shape):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 6)
         with pytest.raises(ValueError, match="inputs must have the shape"):
-            pool.step_into(np.zeros(shape))
+            pool._pool.step(np.zeros(shape), None, None)
 
     def test_observations_in_other_memory(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x", "theta"], 6)

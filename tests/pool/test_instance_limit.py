@@ -12,7 +12,7 @@ from fmu_tools import grouped
 
 import fmugym
 from fmugym.errors import LicenceError
-from fmugym.pool.instance_limit import claiming
+from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.spec import PoolSpec
 
 
@@ -142,7 +142,8 @@ def test_threads_never_get_more_than_there_are():
 
     def work():
         for _ in range(20):
-            with contextlib.suppress(LicenceError), claiming(fmu, spec, 2, "a test"):
+            claim = functools.partial(claim_instances, fmu, spec, 2, "a test")
+            with contextlib.suppress(LicenceError), contextlib.closing(claim()):
                 with lock:
                     taken[0] += 2
                     most[0] = max(most[0], taken[0])

@@ -142,12 +142,12 @@ class Subject:
         self.pool.step_own()
 
     def step(self):
-        self.pool.step_into(np.zeros((len(self.pool.inputs), self.n)), self.mask(), None)
+        self.pool.step(np.zeros((len(self.pool.inputs), self.n)), self.mask())
 
     def reset(self):
         values = self.values.copy()
         values[0, :: int(self.rng.integers(2, 9))] = -1.0  # what the cart-pole refuses, aloud
-        self.pool.reset_into(self.start, values, self.mask() if self.rng.random() < 0.7 else None)
+        self.pool.reset(self.start, values, self.mask() if self.rng.random() < 0.7 else None)
 
     def prepare_play(self):
         variables, before = np.zeros((1, self.n)), np.zeros((1, self.n))

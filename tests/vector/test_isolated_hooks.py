@@ -21,7 +21,7 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
-from fmugym.pool.around import PlayAround
+from fmugym.pool.around import programs_for
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.requests import Answer, Request, request_listing
@@ -193,21 +193,21 @@ def test_a_pool_without_a_library_steps_nothing(make):
     """Whatever is asked of the native pool that runs the programs, nothing crashes."""
     envs = make(Short, 3)
     envs.reset(seed=0)
-    around = PlayAround(envs.inside.pool, envs.inside.pool._spec)
+    around = programs_for(envs.inside.pool, envs.inside.pool._spec)
     actions = np.zeros((3, 1), np.float32)
     for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
         with pytest.raises(ValueError, match="not prepared"):
-            getattr(around._pool, name)(actions, *more)
+            getattr(around, name)(actions, *more)
     with pytest.raises(ValueError, match="not prepared"):
-        around._pool.step_one(make_guard(), int, None, (), 0, {})
+        around.step_one(make_guard(), int, None, (), 0, {})
     before = envs.inside.pool.outputs.copy()
-    assert around._pool.step_own() == 3
+    assert around.step_own() == 3
     nothing = _native.Access(form_of_listing(()))
-    assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
-    code, answer = around._pool.ask(Request.READ, request_listing((), 2))
+    assert around.reset(nothing, np.zeros((0, 3)), None, None) == 3
+    code, answer = around.ask(Request.READ, request_listing((), 2))
     assert code == Answer.FAILURE
     assert answer[:8] == bytes(8)
     np.testing.assert_array_equal(envs.inside.pool.outputs, before)
-    around._pool.close()
+    around.close()
     with pytest.raises(SimulationError, match="closed"):
-        around._pool.step_own()
+        around.step_own()

@@ -6,17 +6,20 @@ import logging
 from typing import Final
 
 from fmugym.archive.fmu import FMU, copy_libraries
-from fmugym.errors import ConfigError, FMULoadError, unknown_name
+from fmugym.checks import check_option
+from fmugym.errors import ConfigError, FMULoadError, warn_once
 from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.by_fmpy import FMPyInstance
 from fmugym.pool.base import Pool
-from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
+from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.wishes import Wishes
 from fmugym.retired import warn_of_gone
 
 __all__ = ["pool_of_backend"]
+
+logger = logging.getLogger(__name__)
 
 _NAMES: Final = ("auto", "fmpy", "fmu", "native", "python")
 
@@ -42,20 +45,18 @@ def pool_of_backend(
             return None
         return _fmpy_pool(fmu, spec, num_instances, log, wishes)
     if spec.fault_retries:
-        fmu.close()
         raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
     return BackendPool(fmu, spec, num_instances, wishes.backend)
 
 
 def _steps_by_fmpy(backend: str) -> bool:
-    if backend not in _NAMES:
-        raise unknown_name("backend", backend, _NAMES)
+    check_option("backend", backend, _NAMES)
     if backend == "native" and not has_native_pool():
         raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
     if backend == "python":
         warn_of_gone("backend='python' means 'fmpy' now: say so")
     if backend in ("auto", "fmu") and not has_native_pool():
-        warn_of_slow_path()
+        warn_once(logger, f"FMUs are stepped by FMPy, which is slow: {HOW_TO_BUILD}")
         return True
     return backend in ("fmpy", "python")
 
@@ -70,7 +71,6 @@ def _fmpy_pool(
     """
     refused = [name for name, is_needed in _beyond_fmpy(fmu, spec, wishes).items() if is_needed]
     if refused:
-        fmu.close()
         raise ConfigError(
             "FMPy steps FMUs for co-simulation with scalar variables here. "
             f"{fmu.path.name} needs the C extension (backend='native') for: {', '.join(refused)}"

@@ -7,13 +7,14 @@ import math
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import compress
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.texts import text_among
+from fmugym.archive.texts import values_by_name
 from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
@@ -24,7 +25,7 @@ from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.pool.health import Column, CountedPool, no_counts, note
+from fmugym.pool.health import Column, CountedPool, new_arrays, note
 from fmugym.pool.spec import is_start_time
 from fmugym.signals import ordinary
 
@@ -62,16 +63,10 @@ class BackendPool(CountedPool):
         self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any, *, is_real: bool = True
     ) -> None:
         if spec.samplings and not getattr(backend, "samples_outputs", False):
-            fmu.close()
             raise ConfigError("a backend has no substeps: leave 'samplings' out of the config")
-        self.num_instances = num_instances
+        self._use(new_arrays(spec, num_instances))
         self._spec, self._is_real = spec, is_real
-        self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))
-        self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
-        self.statuses: StatusArray = np.zeros(num_instances, np.int8)
-        self.observations = np.zeros((num_instances, spec.num_observed), np.float32)
         self._failures = [""] * num_instances
-        self._counts = no_counts(num_instances)
         self._is_ready = np.zeros(num_instances, np.bool_)
         self._ages: FloatArray = np.zeros(num_instances)
         self._paced = backend if isinstance(backend, Paced) else None
@@ -86,9 +81,7 @@ class BackendPool(CountedPool):
 
     def _set_up(self, backend: Any) -> None:
         spec, paced, count = self._spec, self._paced, self.num_instances
-        self._schedule = None
-        if paced is not None:
-            self._schedule = Schedule(spec.time_step, paced.clock, count)
+        self._schedule = None if paced is None else Schedule(spec.time_step, paced.clock, count)
         self._rigs = [Rig(one, spec, self._now) for one in _backends(backend, count)]
         self._threads = [self._thread(index, rig) for index, rig in enumerate(self._rigs)]
         shared = backend if _makes_backends(backend) else None
@@ -104,11 +97,11 @@ class BackendPool(CountedPool):
         hold_after = paced.time_until_hold(self._spec.time_step)
         return Worker(name, paced.clock, Idle(rig.hold, hold_after))
 
-    def prepare_play(self, *parts: Any) -> Play:
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""
-        from fmugym.pool.around import PlayAround
+        from fmugym.pool.around import play_around
 
-        return PlayAround(self, self._spec).prepare(*parts)
+        return play_around(self, self._spec, variables, *parts)
 
     @property
     def is_real(self) -> bool:
@@ -122,12 +115,11 @@ class BackendPool(CountedPool):
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
         self._require_open()
-        chosen = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask)
+        chosen = self._as_mask(mask)
         given = [not (self._is_real and is_start_time(v)) for v in variables]  # it begins now
-        values = values[given]
-        own = [v for v, is_given in zip(variables, given, strict=True) if is_given]
+        own, values = list(compress(variables, given)), values[given]
         starts = {
-            index: _by_name(own, values[:, index].tolist())
+            index: values_by_name(own, values[:, index].tolist())
             for index in np.flatnonzero(chosen).tolist()
         }
         with self._halted_by_errors():
@@ -315,14 +307,6 @@ def _backends(backend: Any, count: int) -> list[Backend]:
             "their number that returns one"
         )
     return backends
-
-
-def _by_name(variables: Sequence[Variable], values: Sequence[float]) -> dict[str, float | str]:
-    """Start values by name; those of Strings as texts."""
-    return {
-        variable.name: text_among(variable, value) if variable.kind == "string" else value
-        for variable, value in zip(variables, values, strict=True)
-    }
 
 
 def _stop(

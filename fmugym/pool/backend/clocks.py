@@ -134,7 +134,7 @@ class ManualClock:
         Returns:
             The thread, not started.
         """
-        return _AwaitedThread(self, target, args, name)
+        return _AwaitedThread(self, target=target, args=args, name=name)
 
     @contextmanager
     def handed_over(self, threads: Sequence[threading.Thread]) -> Iterator[None]:
@@ -180,14 +180,8 @@ class ManualClock:
 
 
 class _AwaitedThread(threading.Thread):
-    def __init__(
-        self,
-        clock: ManualClock,
-        target: Callable[..., object],
-        args: tuple[Any, ...],
-        name: str | None,
-    ) -> None:
-        super().__init__(target=target, args=args, name=name)
+    def __init__(self, clock: ManualClock, **options: Any) -> None:
+        super().__init__(**options)
         self._clock = clock
 
     def start(self) -> None:

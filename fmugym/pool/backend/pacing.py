@@ -7,8 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import number_of
-from fmugym.errors import ConfigError
+from fmugym.checks import check_number
 from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.pool.base import FloatArray, MaskArray
 
@@ -44,9 +43,9 @@ class Paced:
 
     def __post_init__(self) -> None:
         if self.hold_after is not None:
-            number = number_of("hold_after", self.hold_after)
-            if not number > 0.0:
-                raise ConfigError(f"hold_after must be positive, not {number}")
+            number = check_number(
+                "hold_after", self.hold_after, positive=True, may_be_infinite=True
+            )
             object.__setattr__(self, "hold_after", number)
 
     def time_until_hold(self, period: float) -> float:

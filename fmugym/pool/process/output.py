@@ -8,12 +8,11 @@ than a pipe holds waits for its parent.
 from __future__ import annotations
 
 import os
-import select
 import signal
 import sys
 from collections import deque
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 from fmugym.errors import printable
 from fmugym.signals import Ignoring
@@ -44,7 +43,6 @@ class Output:
         self._streams: dict[int, int] = {}  # the descriptor of this process by the reading end
         self._lines: deque[bytes] = deque(maxlen=_LINES)
         self._unfinished = dict.fromkeys(_STREAMS, b"")
-        self._poll: Any = None
         self.writing_ends: list[int] = []
 
     def open(self) -> None:
@@ -55,11 +53,9 @@ class Output:
         """
         if sys.platform == "win32":
             return
-        self._poll = select.poll()
         for stream in _STREAMS:
             reading, writing = os.pipe()
             os.set_blocking(reading, False)
-            self._poll.register(reading, select.POLLIN)
             self._streams[reading] = stream
             self.writing_ends.append(writing)
 
@@ -80,10 +76,8 @@ class Output:
         Returns:
             Whether anything has come.
         """
-        ready = self._poll.poll(0) if self._streams else ()
-        for reading, _ in ready:
-            self._pass_on(reading)
-        return bool(ready)
+        passed_on = [self._pass_on(reading) for reading in self.descriptors]
+        return any(passed_on)
 
     def drain(self) -> None:
         """Pass on everything that a worker has left."""
@@ -91,20 +85,20 @@ class Output:
             if not self.pump():
                 break
 
-    def _pass_on(self, reading: int) -> None:
+    def _pass_on(self, reading: int) -> bool:
         stream = self._streams[reading]
         try:
             data = os.read(reading, _CHUNK)
         except BlockingIOError:
-            return
+            return False
         if not data:  # the worker has closed its end
-            self._poll.unregister(reading)
             os.close(reading)
             del self._streams[reading]
-            return
+            return True
         self._note(stream, data)
         if not self._quiet:
             _write(stream, data)
+        return True
 
     def _note(self, stream: int, data: bytes) -> None:
         *lines, rest = (self._unfinished[stream] + data).split(b"\n")

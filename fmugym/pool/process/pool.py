@@ -67,18 +67,13 @@ class ProcessPool(AskingPool):
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
-        own_files: Whether each worker has a copy of the FMU's files, which is also its working
-            directory.
-        private_libraries: See ``NativePool``.
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
         closing_time: How long workers may take to free their instances in ``close``, in seconds;
             by default 5, or ``call_timeout`` if that is shorter.
-        checks_heap: Whether the C library ends workers that free memory beyond which an FMU has
-            written; only with glibc.
-        on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
-            this process, and the random numbers of the C library differ from worker to worker.
+        make_group: What makes the workers, of the same arguments as a ``WorkerGroup``.
+        options: As for ``Setup.of``.
 
     Attributes:
         workers: How many processes there are.
@@ -98,31 +93,19 @@ class ProcessPool(AskingPool):
         *,
         workers: int | None = None,
         threads: int | None = None,
-        own_files: bool = False,
-        private_libraries: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
         closing_time: float | None = None,
-        checks_heap: bool = False,
-        on_trial: bool = False,
+        make_group: Callable[..., WorkerGroup] = WorkerGroup,
+        **options: bool,
     ) -> None:
-        self.num_instances = num_instances
         self._spec = spec
         self._lock = RLock()
         self._play: PlayOfWorkers | None
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
-            setup = Setup.of(
-                fmu,
-                spec,
-                num_instances,
-                log,
-                threads=threads or max(1, available_processors() // self.workers),
-                own_files=own_files,
-                private_libraries=private_libraries,
-                checks_heap=checks_heap,
-                on_trial=on_trial,
-            )
+            threads = threads or max(1, available_processors() // self.workers)
+            setup = Setup.of(fmu, spec, num_instances, log, threads=threads, **options)
             memory = _make_memory(spec, num_instances, self.workers)
         except BaseException:
             fmu.close()
@@ -130,19 +113,14 @@ class ProcessPool(AskingPool):
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
-        arrays = memory.arrays
-        self.inputs, self.outputs = arrays.inputs, arrays.outputs
-        self.observations, self.statuses = arrays.observations, arrays.statuses
-        self._mask, self._counts = arrays.mask, arrays.counts
-        self._arrays, self._plays, self._play = arrays, 0, None
+        self._use(memory.arrays)
+        self._mask = memory.arrays.mask
+        self._arrays, self._plays, self._play = memory.arrays, 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._group = self._grouped(fmu, setups, memory, log, timeout, closing_time)
+        self._group = make_group(fmu, setups, memory, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._group)
-
-    def _grouped(self, *arguments: Any) -> WorkerGroup:
-        return WorkerGroup(*arguments)
 
     # The contract of Pool.
 
@@ -160,11 +138,6 @@ class ProcessPool(AskingPool):
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
             self._group.note_lost()
-
-    def _as_mask(self, mask: MaskArray | None) -> MaskArray:
-        if mask is None:
-            return np.ones(self.num_instances, np.bool_)
-        return np.asarray(mask, np.bool_)
 
     def _reset(
         self,
@@ -216,27 +189,13 @@ class ProcessPool(AskingPool):
         observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
-        self.step_into(inputs, skip, observations)
-        return self.outputs, self.statuses
-
-    def step_into(
-        self,
-        inputs: FloatArray | None = None,
-        skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
-    ) -> int:
-        """Do one step as ``step`` does.
-
-        Returns:
-            How many of the instances have a status worse than a warning.
-        """
         with self._lock:
             if inputs is not None:
                 np.copyto(self.inputs, inputs)
-            troubled = self._step(skip)
+            self._step(skip)
             if observations is not None:
                 np.copyto(observations, self.observations)
-            return troubled
+            return self.outputs, self.statuses
 
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
@@ -258,13 +217,13 @@ class ProcessPool(AskingPool):
 
     # Compiled hooks
 
-    def prepare_play(self, *parts: Any) -> Play:
+    def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""
-        from fmugym.pool.around import PlayAround
+        from fmugym.pool.around import play_around
 
         self._plays += 1
         self._parts, self._play = parts, None
-        return PlayAround(self, self._spec).prepare(*parts)
+        return play_around(self, self._spec, variables, *parts)
 
     @property
     def rolls_out(self) -> bool:
@@ -298,7 +257,7 @@ class ProcessPool(AskingPool):
     def _describe_play(self) -> PlayOfWorkers:
         from fmugym.pool.process.worker_rollouts import PlayOfWorkers
 
-        return PlayOfWorkers(self._arrays, self._parts[1:])
+        return PlayOfWorkers(self._arrays, self._parts)
 
     def save(self) -> SnapshotOfWorkers:
         """See ``SavingPool.save``."""
@@ -335,28 +294,24 @@ class ProcessPool(AskingPool):
         with self._lock:
             supervisor = self._group.of(index)
             if not self._group.lost[index]:
-                within = index - supervisor.block.start
+                within, tell = index - supervisor.block.start, supervisor.answers.failure
                 content = Writer().integers(within).form()
-                texts = self._group.run(
-                    "a question",
-                    [supervisor],
-                    lambda s: s.tell(
-                        Request.FAILURE,
-                        content,
-                        lambda reader: s.answers.failure(reader, within),
-                    ),
-                )
-                for text in texts.values():
+                for text in self._answers(
+                    [supervisor], Request.FAILURE, content, lambda reader: tell(reader, within)
+                ):
                     return f"{text}{supervisor.printed}"
             return supervisor.reason
+
+    def _answers(self, supervisors: Sequence[Supervisor], *question: Any) -> list[Any]:
+        """Ask workers for what takes no time; see ``Supervisor.tell``."""
+        replies = self._group.run("a question", supervisors, lambda s: s.tell(*question))
+        return list(replies.values())
 
     def _count_steps(self) -> None:
         """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
         with self._lock:
             if not self._group.refusal:
-                self._group.run(
-                    "a question", self._group.able, lambda s: s.tell(Request.COUNT_STEPS)
-                )
+                self._answers(self._group.able, Request.COUNT_STEPS)
 
     def _memory_growth(self) -> HealthArray:
         growth = np.zeros(self.num_instances, np.int64)
@@ -369,14 +324,9 @@ class ProcessPool(AskingPool):
         with self._lock:
             if self._group.refusal or not self._gives_texts:
                 return None
-            group = self._group
             content = Writer().numbers(number).form()
-            answers = group.run(
-                "a question",
-                group.able,
-                lambda s: s.tell(Request.TEXT_OF, content, Reader.text),
-            )
-            return next(filter(None, answers.values()), None)
+            answers = self._answers(self._group.able, Request.TEXT_OF, content, Reader.text)
+            return next(filter(None, answers), None)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""

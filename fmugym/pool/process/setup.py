@@ -40,7 +40,7 @@ class Setup:
     Attributes:
         fmu: The FMU.
         folder: Where it was extracted to.
-        files: Where its files are.
+        copies: Of its libraries, for each of the N instances; empty if they share them.
         before: The libraries to load before its own; see ``FMU.libraries_before``.
         spec: What to do at each reset and step.
         num_instances: N, the instances of all workers together.
@@ -52,15 +52,16 @@ class Setup:
         threads: See ``NativePool``.
         own_files: Whether the worker has a copy of the folder, which is also its working
             directory, because instances would share files otherwise.
-        private_libraries: Whether ``files`` has a library for each of the N instances.
-        checks_heap: See ``ProcessPool``.
-        on_trial: See ``ProcessPool``.
+        checks_heap: Whether the C library ends workers that free memory beyond which an FMU has
+            written; only with glibc.
+        on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
+            this process, and the random numbers of the C library differ from worker to worker.
         wine: What the worker needs to run in Wine; None for one of this system.
     """
 
     fmu: FMU
     folder: Path
-    files: Files
+    copies: tuple[Path, ...]
     before: tuple[tuple[str, str], ...]
     spec: PoolSpec
     num_instances: int
@@ -71,7 +72,6 @@ class Setup:
     number: int = 0
     threads: int = 1
     own_files: bool = False
-    private_libraries: bool = False
     checks_heap: bool = False
     on_trial: bool = False
     wine: Wine | None = None
@@ -89,15 +89,19 @@ class Setup:
     ) -> Setup:
         """Extract an FMU, and say what a worker for all of its instances needs to know.
 
-        The options are those attributes that have a default.
+        Args:
+            fmu: The FMU.
+            spec: What to do at each reset and step.
+            num_instances: N.
+            log: The logger that gets the FMU's messages.
+            private_libraries: See ``NativePool``.
+            options: Those attributes that have a default.
         """
         folder = fmu.extract()
-        copies = copy_libraries(fmu, num_instances) if private_libraries else None
         return cls(
             fmu=fmu,
             folder=folder,
-            files=_files_of(fmu, folder) if copies is None else Files.here(fmu, folder, copies),
-            private_libraries=private_libraries,
+            copies=tuple(copy_libraries(fmu, num_instances)) if private_libraries else (),
             before=_libraries_before(fmu, folder),
             spec=spec.fitting(fmu.description),
             num_instances=num_instances,
@@ -142,10 +146,9 @@ class Setup:
         return replace(
             self,
             folder=folder,
-            files=_files_of(self.fmu, folder),
+            copies=(),  # the process has one instance
             before=_libraries_before(self.fmu, folder),
             directory=directory,
-            private_libraries=False,  # the process has one instance
         )
 
     def order(self) -> Order:
@@ -163,10 +166,10 @@ class Setup:
             form_of_pool(
                 self.description,
                 self.spec,
-                self._files_of_block(),
+                self._files(),
                 self.count,
                 self.threads,
-                private_libraries=self.private_libraries,
+                private_libraries=bool(self.copies),
                 logging=self.logs_all,
                 records=keeps_records(self.description, self.spec),
             )
@@ -177,13 +180,16 @@ class Setup:
         writer.texts([os.fsencode(path) for _, path in self.before])
         return writer.form()
 
-    def _files_of_block(self) -> Files:
-        """The libraries of the worker's own instances, if each has one."""
-        if not self.private_libraries:
-            return self.files
-        parts = len(self.files.paths) // self.num_instances
+    def _files(self) -> Files:
+        """Where the worker finds the FMU, or the copies of libraries for its own instances."""
+        fmu, folder = self.fmu, self.folder
+        if fmu.in_wine:
+            return Files.in_wine(fmu, folder)
+        if not self.copies:
+            return Files.here(fmu, folder, [library for _, library in fmu.libraries_in(folder)])
+        parts = len(self.copies) // self.num_instances
         block = slice(parts * self.block.start, parts * self.block.stop)
-        return replace(self.files, paths=self.files.paths[block])
+        return Files.here(fmu, folder, self.copies[block])
 
     def _write_memory(self, writer: Writer, memory: Memory) -> None:
         """Name the memory on Windows, and in Wine by this process's descriptor of it."""
@@ -192,12 +198,6 @@ class Setup:
         writer.integers(memory.size, self.num_instances, self.block.start)
         *arrays, echo, bell = memory.offsets(self.number)
         writer.integers(*arrays, ECHO_SIZE, echo, bell)
-
-
-def _files_of(fmu: FMU, folder: Path) -> Files:
-    if fmu.in_wine:
-        return Files.in_wine(fmu, folder)
-    return Files.here(fmu, folder, [library for _, library in fmu.libraries_in(folder)])
 
 
 def _libraries_before(fmu: FMU, folder: Path) -> tuple[tuple[str, str], ...]:

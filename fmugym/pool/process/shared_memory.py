@@ -13,18 +13,18 @@ import os
 import secrets
 import sys
 import tempfile
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
-from fmugym.pool.health import HEALTH_COUNTS, HealthArray
+from fmugym.pool.health import Arrays, layout_of
+from fmugym.pool.spec import PoolSpec
 
 if sys.platform == "linux":
     import fcntl
 
-__all__ = ["ECHO_SIZE", "Arrays", "Memory"]
+__all__ = ["ECHO_SIZE", "Memory"]
 
 _ALIGNMENT: Final = 64
 """The alignment of each array, in bytes: a cache line."""
@@ -39,36 +39,6 @@ _BELL: Final = np.dtype(np.uint64)
 
 if sys.platform == "linux":
     _ONE_SIZE: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-
-
-class Arrays(NamedTuple):
-    """The arrays of a pool; see ``Pool``.
-
-    Attributes:
-        mask: Which instances not to step, shape (N,).
-        counts: See ``fmugym.pool.health``, shape (N, HEALTH_COUNTS).
-        progress: The steps of each episode in a rollout, shape (N,).
-    """
-
-    inputs: FloatArray
-    outputs: FloatArray
-    observations: npt.NDArray[np.float32]
-    statuses: StatusArray
-    mask: MaskArray
-    counts: HealthArray
-    progress: npt.NDArray[np.int64]
-
-
-def _layout(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
-    return [
-        ((len(spec.inputs), count), np.float64),
-        ((len(spec.outputs), count), np.float64),
-        ((count, spec.num_observed), np.float32),
-        ((count,), np.int8),
-        ((count,), np.bool_),
-        ((count, HEALTH_COUNTS), np.int64),
-        ((count,), np.int64),
-    ]
 
 
 def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
@@ -96,7 +66,7 @@ class Memory:
     """
 
     def __init__(self, spec: PoolSpec, count: int, workers: int) -> None:
-        layout = _layout(spec, count)
+        layout = layout_of(spec, count)
         sizes = [_padded_size(*row) for row in layout]
         *self._offsets, self._end = itertools.accumulate(sizes, initial=0)
         self.size = self._end + workers * _OWN_SIZE

@@ -124,6 +124,7 @@ class Supervisor:
         reason: Why the last process died.
         growth: By how many bytes the process has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
+        is_busy: Whether a reply is due.
         released: The snapshots without any reference left, by generation and number.
         receiver: Gets the messages of the worker's FMUs.
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
@@ -157,7 +158,7 @@ class Supervisor:
         self._output = Output(setup.on_trial)
         self._deaths = 0
         self._process: Process | None = None
-        self._opening = self._busy = False
+        self._opening = self.is_busy = False
         self._asked = 0.0
 
     @property
@@ -270,7 +271,7 @@ class Supervisor:
 
     def _forget_process(self, reason: str) -> None:
         self.forget()
-        self._opening = self._busy = False
+        self._opening = self.is_busy = False
         self.generation += 1
         self._deaths += 1
         gone = self._deaths >= _MOST_DEATHS
@@ -316,14 +317,9 @@ class Supervisor:
 
     # Requests and replies.
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether a reply is due."""
-        return self._busy
-
     def step(self, request: Request) -> None:
         """Ask the worker to step; failures show in the reply."""
-        self._busy, self._asked, self._read = True, time.monotonic(), None
+        self.is_busy, self._asked, self._read = True, time.monotonic(), None
         try:
             if self.released:
                 self._release()
@@ -344,7 +340,7 @@ class Supervisor:
             content: The content of the request.
             read: Reads the answer; raises a ``DamagedError`` if it is none.
         """
-        self._busy, self._asked, self._read = True, time.monotonic(), read
+        self.is_busy, self._asked, self._read = True, time.monotonic(), read
         self._output.pump()
         with Ignoring(OSError):
             if self.released:
@@ -395,7 +391,7 @@ class Supervisor:
         if self._opening:
             self.finish_opening(deadline)
         result = self._receive(deadline, doing, self._read)
-        self._busy = False
+        self.is_busy = False
         return result
 
     def finish_opening(self, deadline: float) -> None:

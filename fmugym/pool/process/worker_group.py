@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import time
@@ -98,8 +99,6 @@ class WorkerGroup:
     def _finish(self, supervisor: Supervisor) -> None:
         try:
             supervisor.finish_opening(self._deadline(INSTANTIATION))
-        except RefusedError:
-            raise
         except LostError:
             if not supervisor.opens_again():
                 raise
@@ -148,7 +147,9 @@ class WorkerGroup:
         except BaseException:  # such as KeyboardInterrupt: the next call would get these replies
             self._stop_busy(supervisors)
             raise
-        _raise_any(replies.values())
+        for reply in replies.values():
+            if isinstance(reply, FMUGymError):
+                raise SimulationError(str(reply))
         return replies
 
     def _lose(self, supervisor: Supervisor) -> None:
@@ -176,7 +177,12 @@ class WorkerGroup:
 
     def revive(self, supervisors: Iterable[Supervisor]) -> list[Supervisor]:
         """Start missing workers; returns the supervisors that have a worker now."""
-        return [supervisor for supervisor in supervisors if _is_revived(supervisor)]
+        alive = []
+        for supervisor in supervisors:
+            with contextlib.suppress(LostError):
+                supervisor.revive()
+                alive.append(supervisor)
+        return alive
 
     def retire(self, supervisor: Supervisor, reason: str) -> None:
         """End a worker that has not failed; its instances are lost until their reset."""
@@ -204,20 +210,6 @@ class WorkerGroup:
         self._close.detach()
         for supervisor in self.supervisors:
             supervisor.forget()
-
-
-def _is_revived(supervisor: Supervisor) -> bool:
-    try:
-        supervisor.revive()
-    except LostError:
-        return False
-    return True
-
-
-def _raise_any(replies: Iterable[Any]) -> None:
-    for reply in replies:
-        if isinstance(reply, FMUGymError):
-            raise SimulationError(str(reply))
 
 
 def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, timeout: float) -> None:

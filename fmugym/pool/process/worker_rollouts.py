@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray
 from fmugym.pool.form import Writer
+from fmugym.pool.health import Arrays
 from fmugym.pool.play_form import Rows, form_of_play
-from fmugym.pool.process.shared_memory import Arrays
 from fmugym.pool.requests import DamagedError, Reader
 
 __all__ = ["OUTSIDE", "PlayOfWorkers", "read_rolled"]
