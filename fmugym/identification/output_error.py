@@ -33,7 +33,7 @@ from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Limits, Problem
 from fmugym.identification.simulator import Experiment
 from fmugym.identification.statistics import Correlation
-from fmugym.identification.trajectory import Trajectory
+from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray
 
 __all__ = ["FitResult", "fit_of", "fit_parameters"]
@@ -217,6 +217,7 @@ class FitResult:
         self, trajectories: Sequence[Trajectory]
     ) -> tuple[Experiment, list[Trajectory]]:
         """Fix the fitted values, and add fitted constants to the logged inputs."""
+        common_names(trajectories)
         description = self.experiment.fmu.description
         offsets = {n for n in self.values if description.variable(n).causality == "input"}
         fixed = {n: v for n, v in self.values.items() if n not in offsets}
