@@ -12,8 +12,6 @@ from types import MethodType
 import gymnasium as gym
 import numpy as np
 import pytest
-from combinations import in_turn
-from fmu_tools import PlainEnv, probe_config
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
     Drawing,
@@ -159,34 +157,6 @@ def test_tasks_of_users(cls):
     compiled, ended = require_same(lambda hooks: with_hooks(cls, hooks), steps=120)
     assert ended > 1
     assert compiled > 60
-
-
-@pytest.mark.parametrize("cls", TASKS)
-def test_it_is_a_batch_of_one(cls, make_envs):
-    """To the last bit."""
-    one, many = with_hooks(cls, "compiled"), make_envs(cls, 1, hooks="compiled")
-    one.reset(seed=5)
-    many.reset(seed=5)
-    many.action_space.seed(1)
-    for _ in range(60):
-        actions = many.action_space.sample()
-        observations, rewards, terminated, truncated, _ = many.step(actions)
-        result = one.step(actions[0])
-        for observation, row in zip(parts_of(result[0]), parts_of(observations), strict=True):
-            assert observation.tobytes() == row[0].tobytes()
-        assert result[1:4] == (rewards[0], terminated[0], truncated[0])
-        if terminated[0] or truncated[0]:
-            one.reset()
-            many.step(actions)  # which begins the next episode
-    one.close()
-
-
-def parts_of(observation):
-    return (
-        [observation[name] for name in sorted(observation)]
-        if isinstance(observation, dict)
-        else [observation]
-    )
 
 
 class Side(Drawing):
@@ -385,53 +355,6 @@ class TestActions:
         with pytest.raises(ConfigError, match="NaN"):
             one.step(np.array([np.nan], np.float32))
         require_same_steps(one, other, actions[0])
-
-
-class Failing(PlainEnv):
-    """Divides by zero at a certain sum, and may make what is not finite."""
-
-    def _reward_policy(self):
-        return self.state[0] / (self.step_count - 3)
-
-
-class TestFaults:
-    def make(self, probe, hooks, cls=PlainEnv, **changes):
-        env = cls(probe(), probe_config(**changes), log_level=logging.ERROR, hooks=hooks)
-        env.reset(seed=0)
-        return env
-
-    def both(self, probe, actions, cls=PlainEnv, **changes):
-        envs = [self.make(probe, hooks, cls, **changes) for hooks in ("compiled", "python")]
-        results = []
-        for env in envs:
-            outcome = []
-            for action in actions:
-                try:
-                    outcome.append(env.step(np.array([action])))
-                except Exception as error:
-                    outcome.append((type(error).__name__, str(error)))
-                    break
-            results.append(outcome)
-        require_readings(*envs)
-        for env in envs:
-            env.close()
-        return results
-
-    @in_turn({"policy": ["truncate", "terminate", "raise"], "big": [1e308, 1e300]})
-    def test_numbers_that_are_not_finite(self, probe, policy, big):
-        one, other = self.both(probe, [1.0, 2.0, big, big, big], on_fault=policy)
-        assert all(map(same, one, other))
-        assert len(one) == len(other)
-
-    def test_exceptions_of_hooks(self, probe):
-        one, other = self.both(probe, [1.0, 1.0, 1.0, 1.0], Failing)
-        assert all(map(same, one, other))
-        assert one[-1][0] == "ZeroDivisionError"
-
-    def test_inputs_that_are_not_finite(self, probe):
-        one, other = self.both(probe, [1.0, np.inf])
-        assert all(map(same, one, other))
-        assert one[-1][0] == "ConfigError"
 
 
 def branching(hook, name):
