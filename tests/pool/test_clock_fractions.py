@@ -1,19 +1,15 @@
 """Clocks whose intervals are fractions of a second: they tick at exact times."""
 
-import ctypes
 from fractions import Fraction
 from itertools import product, takewhile
 
 import clocks_tools
-import fmpy
 import fmu_tools
 import pytest
 from combinations import in_turn
-from fmpy.fmi3 import FMU3Model
 from pool_tools import KINDS, open_pool, reset, start, step
 
 from fmugym import FMU, FMULoadError
-from fmugym.archive.variable import Interval
 
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 INTERFACES = ("CoSimulation", "ModelExchange")
@@ -107,31 +103,6 @@ def test_a_bad_resolution_is_named(fmu_path, tmp_path, resolution):
         _ = FMU(path).description
     for fact in ("'fixed'", f"resolution='{resolution}'", "4503599627370496"):
         assert fact in str(caught.value)
-
-
-def test_fmpy_gets_the_same_fractions(fmu_path):
-    """What the description and the pool know of the clocks, by FMPy's own calls."""
-    path = str(fmu_path["ModelExchange"])
-    description = fmpy.read_model_description(path, validate=False)  # no "calculated"
-    model = FMU3Model(
-        guid=description.guid,
-        unzipDirectory=fmpy.extract(path),
-        modelIdentifier="Clocks",
-        instanceName="fmpy",
-    )
-    model.instantiate()
-    model.enterInitializationMode()
-    counter, resolution = ctypes.c_uint64(), ctypes.c_uint64()
-    found = {}
-    for name in ("calculated", "tunable", "changing"):
-        reference = (ctypes.c_uint32 * 1)(list(clocks_tools.FRACTIONS).index(name))
-        model.getIntervalFraction(reference, counter, resolution, ctypes.c_int())
-        found[name] = counter.value, resolution.value
-    model.freeInstance()
-    assert found == {"calculated": (1, 3), "tunable": (1, 3), "changing": (1, 30)}
-    constant = FMU(path).variable("constant")
-    assert constant.interval == Interval(1 / 3, 1, 3)
-    assert constant.by_fractions
 
 
 @both_interfaces

@@ -78,14 +78,16 @@ def test_the_callers_array_is_not_done(hooks, pair):
 
 
 @each_kind
-def test_rollouts_leave_done(hooks, make_envs):
+def test_rollouts_leave_done_and_snapshots_have_it(hooks, make_envs):
     envs = make_envs(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
     envs.reset(seed=0)
     while not any(done := envs.get_attr("done")):
         envs.step(np.ones(4, np.int64))
     candidate = envs.save_state(int(np.argmin(done)))
     envs.rollout(candidate, np.ones((8, 30), np.int64))
-    assert envs.get_attr("done") == done
+    other = make_envs(CART_POLE, 4, hooks="per_env")
+    other.restore_state(envs.save_state())
+    assert envs.get_attr("done") == other.get_attr("done") == done
 
 
 @each_kind

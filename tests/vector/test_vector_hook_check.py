@@ -47,19 +47,9 @@ class FarLimitInPython(Drawing):
         return -1.0 if np.any(self.state[0] > 40.0) else 1.0
 
 
-class Norm(Drawing):
-    def _reward_policy(self):
-        return -float(np.linalg.norm(self.state))
-
-
 class NormOfArray(Drawing):
     def _reward_policy(self):
         return -np.linalg.norm(self.state)
-
-
-class LargestOf(Drawing):
-    def _reward_policy(self):
-        return max(self.state)
 
 
 class Mean(Drawing):
@@ -101,18 +91,6 @@ class InPlace(Drawing):
         q, q_dot = self.state
         q *= 2.0
         return q + q_dot
-
-
-class InPlaceByName(Drawing):
-    def _is_done(self):
-        speed = self.out["q_dot"]
-        speed -= 0.1
-        return speed > 1.0
-
-
-class Rounding(Drawing):
-    def _reward_policy(self):
-        return float(round(self.state[0], 1))
 
 
 class Table(Drawing):
@@ -174,17 +152,13 @@ DIFFERENT = {
     AnyOf: "_is_done gives other values",
     FarLimit: "_is_done gives other values",
     FarLimitInPython: "_reward_policy gives other values",
-    Norm: "_reward_policy gives other values",
     NormOfArray: "_reward_policy gives other values",
-    LargestOf: "_reward_policy fails on arrays",
     Mean: "_get_observation gives other values",
     BranchingInputs: "_get_inputs fails on arrays",
     BranchingUpdate: "_update fails on arrays",
     BranchingTruncation: "_is_truncated fails on arrays",
     BranchingInfo: "_get_info fails on arrays",
     InPlace: "_reward_policy changes the arrays in self.state and self.out in place",
-    InPlaceByName: "_is_done changes the arrays in self.state and self.out in place",
-    Rounding: "_reward_policy fails on arrays",
     Table: "_reward_policy fails on arrays",
     Counting: "_update changes self.seen",
     OwnGenerator: "_update changes self.rng",
