@@ -14,7 +14,6 @@ from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 from test_snapshot_machine import Machine
 from test_snapshots import ACTIONS, POOLS, Track, play, play_vector
-from zoo_tools import resident_bytes
 
 import fmugym
 from fmugym import SimulationError
@@ -153,16 +152,3 @@ def test_any_order(copying, hooks):
     machine = type("Own", (Machine,), {"options": {"hooks": hooks}, "make": copying})
     limits = settings(max_examples=15, stateful_step_count=25, deadline=None)
     run_state_machine_as_test(machine, settings=limits)
-
-
-def test_no_growth_over_many_snapshots(copying):
-    with copying() as env:
-        begin(env)
-        kept = [env.save_state() for _ in range(10)]
-        for round_ in range(21):
-            if round_ == 1:
-                before = resident_bytes()
-            for _ in range(1000):
-                kept[round_ % 10] = env.save_state()
-                env.restore_state(kept[0])
-        assert resident_bytes() - before < 2e6

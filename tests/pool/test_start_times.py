@@ -199,13 +199,6 @@ def test_many_environments_equal_single_ones(sun, way, interface, mode):
     assert require_same_alone(partial(Sun, sun(interface)), 14, mode, **way)
 
 
-def test_compiled_single_environments(sun):
-    compiled, plain = Sun(sun(), hooks="compiled"), Sun(sun(), hooks="python")
-    assert play(compiled, 3, 40) == play(plain, 3, 40)
-    compiled.close()
-    plain.close()
-
-
 @in_turn({"way": WAYS, "interface,version": SUNS})
 def test_snapshots_and_rollouts_keep_it(sun, way, interface, version):
     make = partial(Sun, sun(interface, version), max_episode_steps=20)
