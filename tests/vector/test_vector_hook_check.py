@@ -30,21 +30,11 @@ class Branching(Drawing):
         return self.state[1] > 1.0
 
 
-class AnyOf(Drawing):
-    def _is_done(self):
-        return np.any(np.abs(self.state) > 0.9)
-
-
 class FarLimit(Drawing):
     """The hook check's own steps do not reach the limit."""
 
     def _is_done(self):
         return np.any(self.state[0] > 40.0)
-
-
-class FarLimitInPython(Drawing):
-    def _reward_policy(self):
-        return -1.0 if np.any(self.state[0] > 40.0) else 1.0
 
 
 class NormOfArray(Drawing):
@@ -149,9 +139,7 @@ class OwnReset(Drawing):
 
 DIFFERENT = {
     Branching: "_is_done fails on arrays",
-    AnyOf: "_is_done gives other values",
     FarLimit: "_is_done gives other values",
-    FarLimitInPython: "_reward_policy gives other values",
     NormOfArray: "_reward_policy gives other values",
     Mean: "_get_observation gives other values",
     BranchingInputs: "_get_inputs fails on arrays",
