@@ -272,6 +272,8 @@ class TestDynamics:
         plant.rollout(pool, plant.start_values(0, 2), [])
         pool.close()
         pool.close()
+        with pytest.raises(SimulationError, match="closed"):
+            pool.step()
 
 
 class TestArrays:
