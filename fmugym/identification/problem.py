@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number, float_or_nan
+from fmugym.checks import check_number, check_option, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
@@ -429,8 +429,7 @@ def _measured_states(
     states = np.empty((len(initial_states), len(trajectories)))
     for k, (name, source) in enumerate(initial_states.items()):
         if isinstance(source, str):
-            if source not in trajectories[0].outputs:
-                raise unknown_name("measured output", source, trajectories[0].outputs)
+            source = check_option("measured output", source, trajectories[0].outputs)
             states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
         else:
             states[k] = check_number(f"the initial state {shown(name)}", source)

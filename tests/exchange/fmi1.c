@@ -103,40 +103,6 @@ int Model_fmiGetNominalContinuousStates(Model *me, double *x, size_t count) {
     return core_nominals(me, x, count);
 }
 
-/* Co-simulation */
-
-typedef struct {
-    void *logger, *allocate, *release, *finished;
-} SlaveCallbacks;
-
-void *Model_fmiInstantiateSlave(const char *name, const char *token, const char *location,
-                                const char *mime_type, double timeout, char visible,
-                                char interactive, SlaveCallbacks callbacks, char logging) {
-    return core_new(name, false, callbacks.logger, NULL);
-}
-
-void Model_fmiFreeSlaveInstance(Model *me) {
-    free(me);
-}
-
-int Model_fmiInitializeSlave(Model *me, double start, char has_stop, double stop) {
-    const int status = core_enter_initialization(me, start);
-
-    return status != OK ? status : core_exit_initialization(me);
-}
-
-int Model_fmiTerminateSlave(Model *me) {
-    return Model_fmiTerminate(me);
-}
-
-int Model_fmiResetSlave(Model *me) {
-    return core_reset(me);
-}
-
-int Model_fmiDoStep(Model *me, double time, double step, char new_step) {
-    return core_do_step(me, time, step);
-}
-
 const char *Model_fmiGetVersion(void) {
     return "1.0";
 }

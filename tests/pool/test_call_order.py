@@ -13,7 +13,6 @@ import warnings
 import lawful_tools
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv
 from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -53,20 +52,10 @@ ACTIONS = st.sampled_from([0.5, 0.5, -1.0, -1.0, np.nan])
 MASKS = st.lists(st.booleans(), min_size=N, max_size=N).map(np.array)
 
 
-class LawfulEnv(PlainEnv):
+class LawfulEnv(lawful_tools.LawfulEnv):
     """Ends its task now and then."""
 
     steps_after_end = True
-
-    def __init__(self, path, **changes):
-        config = {
-            "model_input_names": "u",
-            "model_output_names": "y",
-            "model_parameters": {"k": 1.0},
-            "time_step": 0.5,
-            "bounds": {"u": (-1, 1)},
-        }
-        super().__init__(path, config | changes, logging.CRITICAL)
 
     def _is_done(self):
         return self.state[0] < -1.5

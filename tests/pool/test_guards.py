@@ -1,7 +1,6 @@
 """Guards in the process, in all pools: finite values, retries, health, leaks."""
 
 import ctypes
-import logging
 import sys
 
 import gymnasium as gym
@@ -9,7 +8,7 @@ import lawful_tools
 import numpy as np
 import pytest
 from combinations import in_turn
-from fmu_tools import MAJOR_VERSIONS, PlainEnv, grouped
+from fmu_tools import MAJOR_VERSIONS
 from gymnasium import spaces
 from pool_tools import KINDS, open_pool, reset
 
@@ -64,19 +63,6 @@ def step(pool, *inputs):
     return pool.step(np.array([inputs]))
 
 
-class LawfulEnv(PlainEnv):
-    """y' = k u."""
-
-    def __init__(self, path, backend="auto", **changes):
-        config = {
-            "model_input_names": "u",
-            "model_output_names": "y",
-            "time_step": 0.8,
-            "bounds": {"u": (-1, 1)},
-        }
-        super().__init__(path, grouped(config | changes), logging.CRITICAL, backend=backend)
-
-
 class TestFiniteInputs:
     @every_version
     def test_only_the_instance_with_a_bad_one_is_not_stepped(self, pool, version):
@@ -92,7 +78,7 @@ class TestFiniteInputs:
 
     @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
     def test_made_by_a_hook_from_integer_actions(self, lawful, opened, hooks):
-        class Dividing(LawfulEnv):
+        class Dividing(lawful_tools.LawfulEnv):
             def _get_action_space(self):
                 return spaces.Discrete(2)
 
@@ -104,7 +90,7 @@ class TestFiniteInputs:
         with np.errstate(divide="ignore"), pytest.raises(ConfigError, match=r"finite"):
             envs.step(np.array([1, 0]))
         envs.reset(seed=0)
-        assert envs.step(np.array([1, 1]))[0].tolist() == [[pytest.approx(0.8)]] * 2
+        assert envs.step(np.array([1, 1]))[0].tolist() == [[0.5]] * 2
 
 
 class TestRetries:
@@ -144,11 +130,11 @@ class TestRetries:
         assert (pool.health()["retries"] > 0).all()
 
     def test_are_told_in_the_info(self, lawful, opened):
-        config = {"fault_retries": 2, "model_parameters": {"longest": 0.5}}
-        env = opened(LawfulEnv(lawful[2], **config))
+        config = {"fault_retries": 2, "model_parameters": {"longest": 0.3}}
+        env = opened(lawful_tools.LawfulEnv(lawful[2], **config))
         assert env.reset()[1]["retries"] == 0
         assert env.step([1.0])[4]["retries"] == 1
-        envs = opened(FMUVectorEnv(lambda: LawfulEnv(lawful[2], **config), 3))
+        envs = opened(FMUVectorEnv(lambda: lawful_tools.LawfulEnv(lawful[2], **config), 3))
         envs.reset(options={"model_parameters": {"longest": 0.0}})
         mask = np.array([False, True, False])
         envs.reset(options={"reset_mask": mask})
@@ -158,12 +144,12 @@ class TestRetries:
         with pytest.raises(
             ConfigError, match=r"'fault_retries' needs an FMU that can get and set .* Lawful"
         ):
-            LawfulEnv(lawful[1], fault_retries=1)
+            lawful_tools.LawfulEnv(lawful[1], fault_retries=1)
 
     @pytest.mark.parametrize("count", [-1, 11, 1.5, True])
     def test_number(self, lawful, count):
         with pytest.raises(ConfigError, match="fault_retries must be an integer from 0 to 10, got"):
-            LawfulEnv(lawful[2], fault_retries=count)
+            lawful_tools.LawfulEnv(lawful[2], fault_retries=count)
 
 
 class TestHealth:

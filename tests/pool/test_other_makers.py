@@ -12,6 +12,7 @@ import pytest
 from combinations import in_turn
 
 import fmugym
+from fmugym import errors
 from fmugym.archive.bundled import FMI_VERSIONS, bundled_fmu
 
 pytestmark = pytest.mark.usefixtures("trials")
@@ -97,3 +98,17 @@ def test_vector(make_fmu, name, way, make_envs):
             told = infos.get("drawn", {}).items()
             drawn = {n: values[index] for n, values in told if not n.startswith("_")}
             assert states == expected(path, name, drawn, length, index)
+
+
+def test_the_need_of_a_tool_is_told_once(make_fmu, caplog, monkeypatch):
+    """A search opens an FMU many times."""
+    monkeypatch.setattr(errors, "_warned", set())
+    for _ in range(2):
+        MadeEnv(make_fmu("pythonfmu"), "pythonfmu").close()
+    assert caplog.text.count("Tank.fmu needs the tool that exported it to run") == 1
+
+
+def test_what_is_invalid_in_it_does_not_stop(make_fmu):
+    """Without a variability, Integers and Booleans are continuous, which the standard forbids."""
+    findings = fmugym.FMU(make_fmu("pythonfmu")).description.findings
+    assert any("variability" in finding for finding in findings)

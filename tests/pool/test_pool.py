@@ -33,7 +33,7 @@ OPTIONS |= {f"system in {name}": OPTIONS[name] for name in ("native", "process")
 
 PAIRS = [
     *(("native", 2), ("system in native", 3), ("native", 3), ("system in process", 2)),
-    *(("native", 1), ("process", 3), ("wine", 1), ("fmpy", 2)),
+    *(("native", 1), ("process", 3), ("wine", 1), ("fmpy", 2), ("fmpy", 1), ("fmpy", 3)),
 ]
 """Implementations with versions of FMI, which differ in the native one above all."""
 
@@ -272,6 +272,8 @@ class TestDynamics:
         plant.rollout(pool, plant.start_values(0, 2), [])
         pool.close()
         pool.close()
+        with pytest.raises(SimulationError, match="closed"):
+            pool.step()
 
 
 class TestArrays:

@@ -199,13 +199,6 @@ def test_many_environments_equal_single_ones(sun, way, interface, mode):
     assert require_same_alone(partial(Sun, sun(interface)), 14, mode, **way)
 
 
-def test_compiled_single_environments(sun):
-    compiled, plain = Sun(sun(), hooks="compiled"), Sun(sun(), hooks="python")
-    assert play(compiled, 3, 40) == play(plain, 3, 40)
-    compiled.close()
-    plain.close()
-
-
 @in_turn({"way": WAYS, "interface,version": SUNS})
 def test_snapshots_and_rollouts_keep_it(sun, way, interface, version):
     make = partial(Sun, sun(interface, version), max_episode_steps=20)
@@ -231,10 +224,9 @@ def test_snapshots_and_rollouts_keep_it(sun, way, interface, version):
 @all_ways
 def test_the_stop_time_ends_episodes(sun, way):
     make = partial(Sun, sun(), start_time=[1.0, 2.0, 3.0], stop_time=4.5, max_episode_steps=9)
-    env, envs = make(), vector(make, 1, **way)
-    rows, expected = [envs.reset(seed=5)[0][0].tolist()], play(env, 5, 30)
-    rows += [envs.step(np.zeros((1, 1), np.float32)).observations[0].tolist() for _ in range(30)]
-    assert rows == [row[0] for row in expected][: len(rows)]
+    assert require_same_alone(make, 30, **way)
+    with make() as env:
+        expected = play(env, 5, 30)
     lengths, count = set(), 0
     for row in expected:
         if len(row) == 2:
@@ -244,8 +236,6 @@ def test_the_stop_time_ends_episodes(sun, way):
         assert row[3] == (count == min(9, (4.5 - start) / STEP))
         lengths |= {count} if row[3] else set()
     assert lengths == {9, 6}
-    env.close()
-    envs.close()
 
 
 def test_kept_initial_states_are_of_one_start_time(sun):

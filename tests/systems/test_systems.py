@@ -250,7 +250,7 @@ def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, tmp_path):
     links = (("a", "theta_dot", "b", "tau"), ("b", "theta", "c", "tau"))
     starts = {"a": 0.3, "b": 0.6, "c": 0.9}
     path = bundled_fmu("Pendulum", "3.0")
-    names = [(name, variable) for variable in ("theta", "q_0") for name in starts]
+    names = {f"{name}.{v}": (name, v) for v in ("theta", "q_0") for name in starts}
     file = container_tools.container(tmp_path, path, list(starts), links, names, 0.02)
     found = fmpy.simulate_fmu(
         str(file),

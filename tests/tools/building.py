@@ -42,7 +42,8 @@ def library(*sources, flags=(), stubs=None):
         stubs: The text of the file that the sources include as ``STUBS``.
     """
     key = sources, flags, stubs
-    return once(key, fmpy.sharedLibraryExtension, lambda path: _compile(path, *key))
+    command = [*compiler(), *FLAGS, "-pthread"]
+    return once(key, fmpy.sharedLibraryExtension, lambda path: compile_to(path, command, *key))
 
 
 def once(key, suffix, build):
@@ -62,14 +63,14 @@ def once(key, suffix, build):
         return path.read_bytes()
 
 
-def _compile(path, sources, flags, stubs):
-    """Compile elsewhere and move the result, for another process may do the same."""
+def compile_to(path, command, sources, flags, stubs):
+    """Compile elsewhere and move the result, for another process may do the same.
+
+    The name that a library for Windows is compiled under becomes a part of it.
+    """
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        built = Path(folder) / path.name
-        command = [*compiler(), *FLAGS, *flags]
-        if stubs is not None:
-            (Path(folder) / "stubs.h").write_text(stubs)
-            command += [f"-I{folder}", '-DSTUBS="stubs.h"']
-        command += [*(HERE / source for source in sources), "-o", built, "-lm", "-lpthread"]
-        subprocess.run(command, check=True)
-        built.replace(path)
+        (Path(folder) / "stubs.h").write_text(stubs or "")
+        files = [HERE / source for source in sources]
+        own = ["-I.", '-DSTUBS="stubs.h"', *flags, *files, "-o", "made", "-lm"]
+        subprocess.run([*command, *own], check=True, cwd=folder)
+        (Path(folder) / "made").replace(path)

@@ -104,14 +104,8 @@ def describe(model, version, interfaces=("ModelExchange",), flags=""):
         f'<{name} modelIdentifier="Model" {FLAGS[version]} {flags}{_extra(version, name)}/>'
         for name in (() if version == 1 else interfaces)
     )
-    if version == 1 and interfaces == ("CoSimulation",):
-        capabilities = f'<Capabilities canHandleVariableCommunicationStepSize="true" {flags}/>'
-        stand_alone = f"<CoSimulation_StandAlone>{capabilities}</CoSimulation_StandAlone>"
-        structure = f"<Implementation>{stand_alone}</Implementation>"
-    else:
-        structure = _structure(version, model)
     inside = f'{inside}<DefaultExperiment startTime="0" stepSize="0.01"/>'
-    inside += f"<ModelVariables>{elements}</ModelVariables>{structure}"
+    inside += f"<ModelVariables>{elements}</ModelVariables>{_structure(version, model)}"
     return f"<fmiModelDescription {_head(version, model)}>{inside}</fmiModelDescription>"
 
 

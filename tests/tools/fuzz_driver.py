@@ -124,6 +124,16 @@ def run(program, count, seed, first=0, report=lambda line: None):
     return tally
 
 
+def of_kinds(kinds):
+    """A program of functions that make what is played of a random generator and a folder."""
+
+    def make(rng, folder):
+        kind = rng.choice(kinds)
+        return Case(kind(rng, folder), kind.__name__)
+
+    return lambda: contextlib.nullcontext(make)
+
+
 def _run_one(make, seed, folder):
     """Run one case; returns its kind, how it ended, and what is wrong with it."""
     before = set(os.listdir(folder))

@@ -16,6 +16,7 @@ import sys
 import gymnasium
 import numpy as np
 import odd_values
+from fmu_tools import PlainEnv
 from fuzz_driver import Case, describe, main
 from odd_values import hostile
 
@@ -158,16 +159,8 @@ def use(env, seed=0):
             env.reset()
 
 
-@contextlib.contextmanager
-def closing(env):
-    try:
-        yield env
-    finally:
-        env.close()
-
-
 def make_and_use(make):
-    with closing(make()) as env:
+    with contextlib.closing(make()) as env:
         if is_small(env.config) and env.config.isolation is None:
             use(env)
 
@@ -197,15 +190,7 @@ def nested_in_config(rng):
 
 def as_config(rng):
     value = odd(rng)
-    return value, lambda: make_and_use(lambda: fmugym_env(value))
-
-
-def fmugym_env(config):
-    class Plain(fmugym.FMUEnv):
-        def _is_done(self):
-            return False
-
-    return Plain(fmugym.bundled_fmu("Pendulum"), config)
+    return value, lambda: make_and_use(lambda: PlainEnv(fmugym.bundled_fmu("Pendulum"), value))
 
 
 def as_argument(rng):
@@ -371,7 +356,7 @@ def as_vector_argument(rng):
     make = rng.choice((Swing, Swing, Swing, Swing if callable(other) else other))
 
     def call():
-        with closing(FMUVectorEnv(make, **{"num_envs": 2, **arguments})) as env:
+        with contextlib.closing(FMUVectorEnv(make, **{"num_envs": 2, **arguments})) as env:
             use(env)
 
     return (describe(make), arguments), call

@@ -6,12 +6,11 @@ A case calls one public function, class or method with one or two arguments of a
 or shape. See ``fuzz_driver.py``.
 """
 
-import contextlib
 import functools
 import sys
 
 import numpy as np
-from fuzz_driver import Case, main
+from fuzz_driver import main, of_kinds
 from odd_values import odd, spoil
 
 from fmugym import bundled_fmu
@@ -42,7 +41,7 @@ def fitted():
     return fit_parameters(**FIT)
 
 
-def fit(rng):
+def fit(rng, folder):
     """Fit with odd arguments, or with odd values in a dict of them."""
     arguments = spoil(rng, FIT)
     if rng.random() < 0.5:
@@ -51,7 +50,7 @@ def fit(rng):
     return lambda: fit_parameters(**arguments)
 
 
-def trajectory(rng):
+def trajectory(rng, folder):
     arguments = {"time": TIME, "outputs": SWING, "inputs": {"tau": 0.0}, "label": "x"}
     if rng.random() < 0.5:
         name = rng.choice(("outputs", "inputs"))
@@ -60,7 +59,7 @@ def trajectory(rng):
     return lambda: Trajectory(**spoiled)
 
 
-def method(rng):
+def method(rng, folder):
     """Call a method of a result or of a trajectory with one odd argument."""
     made, value = FIT["trajectories"][0], odd(rng)
     calls = (
@@ -77,18 +76,7 @@ def method(rng):
     return lambda: call(value)
 
 
-KINDS = (fit, trajectory, method, method)
-
-
-@contextlib.contextmanager
-def program():
-    """See ``fuzz_driver.run``."""
-
-    def make(rng, folder):
-        kind = rng.choice(KINDS)
-        return Case(kind(rng), kind.__name__)
-
-    yield make
+program = of_kinds((fit, trajectory, method, method))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import odd_values
-from fuzz_driver import Case, CaseError, main, require
+from fuzz_driver import CaseError, main, of_kinds, require
 from odd_values import NUMBERS, Unspeakable
 
 from fmugym import ConfigError
@@ -365,18 +365,7 @@ def odd_client(rng, folder):
     return lambda: Client(odd(rng))
 
 
-KINDS = (odd_lab, odd_client, *(odd_call,) * 6)
-
-
-@contextlib.contextmanager
-def program():
-    """See ``fuzz_driver.run``."""
-
-    def make(rng, folder):
-        kind = rng.choice(KINDS)
-        return Case(kind(rng, folder), kind.__name__)
-
-    yield make
+program = of_kinds((odd_lab, odd_client, *(odd_call,) * 6))
 
 
 if __name__ == "__main__":

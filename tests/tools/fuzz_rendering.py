@@ -6,10 +6,9 @@ A case makes one object or draws one shape with one or two arguments of a wrong 
 shape. See ``fuzz_driver.py``.
 """
 
-import contextlib
 import sys
 
-from fuzz_driver import Case, main
+from fuzz_driver import main, of_kinds
 from odd_values import odd, spoil
 
 from fmugym.rendering import (
@@ -48,24 +47,24 @@ RENDERER = {
 OVERLAY = {"time": 0.0, "action": "+1 N", "reward": 1.0, "episode_return": 2.0}
 
 
-def shape(rng):
+def shape(rng, folder):
     name = rng.choice(tuple(SHAPES))
     arguments = spoil(rng, SHAPES[name] | {"color": RED})
     canvas = Canvas((40, 40), World(**BOUNDS))
     return lambda: (getattr(canvas, name)(**arguments), canvas.picture())
 
 
-def canvas(rng):
+def canvas(rng, folder):
     spoiled = spoil(rng, {"size": (40, 40), "world": World(**BOUNDS)})
     return lambda: Canvas(**spoiled)
 
 
-def world(rng):
+def world(rng, folder):
     spoiled = spoil(rng, BOUNDS)
     return lambda: Canvas((40, 40), World(**spoiled)).circle(HERE, 0.5, RED)
 
 
-def scene(rng):
+def scene(rng, folder):
     arguments = {"x_threshold": 2.4, "pole_length": 1.0, "angle_threshold": 0.2}
     spoiled = spoil(rng, arguments | {"force_scale": 1.0})
     if rng.random() < 0.3:
@@ -74,7 +73,7 @@ def scene(rng):
     return lambda: Renderer(CartPoleScene(**spoiled), (40, 40)).render(CartPoleFrame(0.1, 0.1))
 
 
-def frame(rng):
+def frame(rng, folder):
     """Draw an odd frame, or a frame of odd values, perhaps with an odd overlay."""
     spoiled = spoil(rng, {"angle": 1.0, "torque": 0.5})
     overlay = spoil(rng, OVERLAY)
@@ -83,23 +82,12 @@ def frame(rng):
     return lambda: Renderer(PendulumScene(1.0), (40, 40)).render(value, corner())
 
 
-def renderer(rng):
+def renderer(rng, folder):
     spoiled = spoil(rng, RENDERER)
     return lambda: Renderer(**spoiled).render(PendulumFrame(1.0), Overlay(0.0))
 
 
-KINDS = (shape, shape, canvas, world, scene, frame, renderer)
-
-
-@contextlib.contextmanager
-def program():
-    """See ``fuzz_driver.run``."""
-
-    def make(rng, folder):
-        kind = rng.choice(KINDS)
-        return Case(kind(rng), kind.__name__)
-
-    yield make
+program = of_kinds((shape, shape, canvas, world, scene, frame, renderer))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """An FMU that notes illegal calls (``lawful.c``), and the file where it notes them."""
 
+import logging
 import mmap
 import struct
 from pathlib import Path
@@ -72,3 +73,16 @@ def lawful_fmu(folder, version):
         fmu_tools.library_name(version, "Lawful"): library(version),
     }
     return fmu_tools.write_fmu(Path(folder) / "Lawful.fmu", files)
+
+
+class LawfulEnv(fmu_tools.PlainEnv):
+    """y' = k u."""
+
+    def __init__(self, path, **changes):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "time_step": 0.5,
+            "bounds": {"u": (-1, 1)},
+        }
+        super().__init__(path, fmu_tools.grouped(config | changes), logging.CRITICAL)

@@ -5,17 +5,8 @@ import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import fmpy
 import pytest
-from fmpy.container_fmu.cli import create_container_fmu
-from fmpy.container_fmu.config import Component, Configuration, Connection
-from fmpy.model_description import (
-    CoSimulation,
-    DefaultExperiment,
-    ModelDescription,
-    ModelVariable,
-    Unknown,
-)
+from container_tools import container
 
 import fmugym
 
@@ -57,39 +48,12 @@ def by_python(package, script):
 
 def by_fmpy(version):
     """Two pendulums, of which the first drives the second, in a container of FMPy."""
-
-    def build(folder):
-        parts = [_component(name) for name in ("first", "second")]
-        inside = {
-            part.name: {v.name: v for v in part.modelDescription.modelVariables} for part in parts
-        }
-        first, second = inside["first"], inside["second"]
-        variables = [
-            _variable("tau", "input", first["tau"], version),
-            _variable("q_first", "output", first["q"], version),
-            _variable("q_second", "output", second["q"], version),
-        ]
-        mapped = [(parts[0], first["tau"]), (parts[0], first["q"]), (parts[1], second["q"])]
-        description = _container_description(version, variables)
-        config = Configuration(
-            parallelDoStep=False,
-            modelDescription=description,
-            components=parts,
-            connections=[Connection(parts[0], [first["q"]], parts[1], [second["tau"]], 1)],
-            variableMappings={v: [pair] for v, pair in zip(variables, mapped, strict=True)},
-        )
-        (folder / "unzipped").mkdir()
-        path = folder / "Container.fmu"
-        create_container_fmu(config, folder / "unzipped", path)
-        return path
-
-    return build
-
-
-def _component(name):
-    """A pendulum of FMI 3.0: FMPy cannot connect the types of FMI 2.0."""
-    path = fmugym.bundled_fmu("Pendulum", "3.0")
-    return Component(name, Path(path), fmpy.read_model_description(str(path)))
+    path = Path(fmugym.bundled_fmu("Pendulum", "3.0"))
+    names = {"tau": ("first", "tau"), "q_first": ("first", "q"), "q_second": ("second", "q")}
+    link = ("first", "q", "second", "tau")
+    return lambda folder: container(
+        folder, path, ("first", "second"), [link], names, PENDULUMS["step"], version
+    )
 
 
 def by_renault(version):
@@ -117,35 +81,6 @@ def by_renault(version):
         return folder / "Pendulums.fmu"
 
     return build
-
-
-def _variable(name, causality, like, version):
-    return ModelVariable(
-        name=name,
-        causality=causality,
-        variability="continuous",
-        type="Real" if version == 2 else "Float64",
-        initial=None if causality == "input" else "calculated",
-        start="0" if causality == "input" else None,
-        min=like.min,
-        max=like.max,
-    )
-
-
-def _container_description(version, variables):
-    interface = CoSimulation(modelIdentifier="container_fmu", fixedInternalStepSize=0.02)
-    outputs = [Unknown(variable=v) for v in variables if v.causality == "output"]
-    time = ModelVariable(name="time", causality="independent", variability="continuous")
-    time.type = "Real" if version == 2 else "Float64"
-    return ModelDescription(
-        fmiVersion=f"{version}.0",
-        modelName="Pendulums",
-        instantiationToken="{two-pendulums}",
-        coSimulation=interface,
-        defaultExperiment=DefaultExperiment(startTime="0", stopTime="10"),
-        modelVariables=[time, *variables],
-        outputs=outputs,
-    )
 
 
 PENDULUMS = {"inputs": {"tau": 0.5}, "outputs": ("q_first", "q_second"), "step": 0.02}

@@ -58,19 +58,24 @@ def describe(version, token, variables, flags=None, categories=(), name="Zoo"):
         categories: The names of those in which the FMU logs.
         name: Of the model, and of its library.
     """
-    head = f'fmiVersion="{version}.0" modelName="{name}"'
-    head += f' {"instantiationToken" if version == 3 else "guid"}="{token}"'
     flags = STATES[version] if flags is None else flags
     elements = (_element(version, index, *row) for index, row in enumerate(variables))
-    inside = f"<ModelVariables>{''.join(elements)}</ModelVariables>"
+    before = "" if version == 1 else _categories(categories)
+    return document(version, token, "".join(elements), flags, name, before)
+
+
+def document(version, token, variables, flags, name, before=""):
+    """A model description of elements for variables, and of others before them."""
+    head = f'fmiVersion="{version}.0" modelName="{name}"'
+    head += f' {"instantiationToken" if version == 3 else "guid"}="{token}"'
+    inside = f"{before}<ModelVariables>{variables}</ModelVariables>"
     if version == 1:
         head += f' modelIdentifier="{name}"'
         head += ' numberOfContinuousStates="0" numberOfEventIndicators="0"'
         inside += f"<Implementation><CoSimulation_StandAlone><Capabilities {flags}/>"
         inside += "</CoSimulation_StandAlone></Implementation>"
     else:
-        interface = f'<CoSimulation modelIdentifier="{name}" {flags}/>'
-        inside = f"{interface}{_categories(categories)}{inside}<ModelStructure/>"
+        inside = f'<CoSimulation modelIdentifier="{name}" {flags}/>{inside}<ModelStructure/>'
     return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
 
 

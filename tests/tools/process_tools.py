@@ -89,39 +89,32 @@ class FaultyEnv(fmugym.FMI2CSEnv):
         return self.state[0] < -1e9
 
 
-def processes_with(folder):
-    """The numbers of the processes, other than this one, that have a file of a folder mapped."""
-    found = []
-    for process in Path("/proc").iterdir():
-        if process.name.isdigit() and int(process.name) != os.getpid():
-            try:
-                maps = (process / "maps").read_text()
-            except OSError:  # it has ended, or is another user's
-                continue
-            found += [int(process.name)] if str(folder) in maps else []
-    return found
-
-
-def processes_of_session(leader):
-    """The numbers of the processes that live, or wait for their parent, in a session."""
-    found = []
-    for process in Path("/proc").iterdir():
-        if process.name.isdigit():
-            with contextlib.suppress(OSError):  # it has ended
-                fields = (process / "stat").read_text().rpartition(")")[2].split()
-                found += [int(process.name)] if int(fields[3]) == leader else []
-    return found
-
-
-def processes_told_of(folder):
-    """The numbers of the processes that live and whose environment variables name a folder."""
+def _processes(is_meant):
+    """The numbers of the processes that live and of which something holds, by their folders."""
     found = []
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
             with contextlib.suppress(OSError):  # it has ended, or is another user's
-                told = os.fsencode(folder) in (process / "environ").read_bytes()
-                found += [int(process.name)] if told else []
+                found += [int(process.name)] if is_meant(process) else []
     return found
+
+
+def processes_with(folder):
+    """The numbers of the processes, other than this one, that have a file of a folder mapped."""
+    own = str(os.getpid())
+    return _processes(lambda one: one.name != own and str(folder) in (one / "maps").read_text())
+
+
+def processes_of_session(leader):
+    """The numbers of the processes that live, or wait for their parent, in a session."""
+    return _processes(
+        lambda one: int((one / "stat").read_text().rpartition(")")[2].split()[3]) == leader
+    )
+
+
+def processes_told_of(folder):
+    """The numbers of the processes that live and whose environment variables name a folder."""
+    return _processes(lambda one: os.fsencode(folder) in (one / "environ").read_bytes())
 
 
 @contextlib.contextmanager

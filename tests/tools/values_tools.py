@@ -4,6 +4,7 @@ from pathlib import Path
 
 import building
 import fmu_tools
+import model_tools
 import pytest
 from gymnasium import spaces
 
@@ -149,7 +150,9 @@ def _describe_feedthrough(version):
         for i in (1, 2):
             variables += _variable(version, f"v[{i}]", "Real", 3 + i, "input")
             variables += _variable(version, f"w[{i}]", "Real", 5 + i, "output")
-    return _document(version, variables)
+    types = f"<TypeDefinitions>{_GEARS[version]}</TypeDefinitions>"
+    flags = f'{model_tools.STATES[version]} canHandleVariableCommunicationStepSize="true"'
+    return model_tools.document(version, "{feedthrough}", variables, flags, "Model", types)
 
 
 def _variable(version, name, type_, reference, causality):
@@ -180,26 +183,6 @@ _GEARS = {
     3: '<EnumerationType name="Gear"><Item name="low" value="1"/><Item name="high" value="2"/>'
     "</EnumerationType>",
 }
-
-
-def _document(version, variables):
-    token = "instantiationToken" if version == 3 else "guid"
-    head = f'fmiVersion="{version}.0" modelName="Feedthrough" {token}="{{feedthrough}}"'
-    types = f"<TypeDefinitions>{_GEARS[version]}</TypeDefinitions>"
-    flags = {
-        1: "",
-        2: 'canGetAndSetFMUstate="true"',
-        3: 'canGetAndSetFMUState="true"',
-    }[version]
-    flags += ' canHandleVariableCommunicationStepSize="true"'
-    inside = f"{types}<ModelVariables>{variables}</ModelVariables>"
-    if version == 1:
-        head += ' modelIdentifier="Model" numberOfContinuousStates="0" numberOfEventIndicators="0"'
-        inside += f"<Implementation><CoSimulation_StandAlone><Capabilities {flags}/>"
-        inside += "</CoSimulation_StandAlone></Implementation>"
-    else:
-        inside = f'<CoSimulation modelIdentifier="Model" {flags}/>{inside}<ModelStructure/>'
-    return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
 
 
 STEP = 0.1

@@ -2,9 +2,7 @@
 
 import contextlib
 import functools
-import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import building
@@ -46,25 +44,12 @@ def _library(model, version):
 
 
 @functools.cache
-def windows_library(*sources, flags=(), stubs=""):
+def windows_library(*sources, flags=(), stubs=None):
     """The bytes of a library for Windows; the arguments are those of ``building.library``."""
-    key = sources, flags, stubs or ""
-    return building.once(key, ".dll", lambda path: _compile(path, *key))
-
-
-def _compile(path, sources, flags, stubs):
-    """Compile elsewhere and move the result, for another process may do the same.
-
-    The name that the library is compiled under becomes a part of it.
-    """
+    key = sources, flags, stubs
     command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu"]
-    command += ["-shared", "-O1", "-g0", "-ffp-contract=off", '-DSTUBS="stubs.h"', "-I.", *flags]
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        (Path(folder) / "stubs.h").write_text(stubs)
-        target = Path(folder) / "made.dll"
-        files = [building.HERE / source for source in sources]
-        subprocess.run([*command, *files, "-o", target], check=True, cwd=folder)
-        target.replace(path)
+    command += ["-shared", "-O1", "-g0", "-ffp-contract=off"]
+    return building.once(key, ".dll", lambda path: building.compile_to(path, command, *key))
 
 
 @contextlib.contextmanager

@@ -1,6 +1,5 @@
 """Rollouts of candidates that assume other data, outputs and random numbers than their episode."""
 
-import csv
 from functools import partial
 
 import numpy as np
@@ -10,8 +9,6 @@ from test_snapshots import Track
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.envs import HouseEnv
-from fmugym.envs.house import HOUSE_TASK
 
 HOUR, DT, STEPS, N = 3600.0, 600.0, 20, 3
 TIMES = np.arange(24) * HOUR
@@ -115,20 +112,6 @@ class TestData:
         assert rows_of(envs.rollout(snapshot, pushes(), data=later)) != rows_of(plain)
         assert rows_of(envs.rollout(snapshot, pushes())) == rows_of(plain)
 
-    def test_that_is_true_changes_no_bit_of_the_house(self, vector_of):
-        with open(HOUSE_TASK.with_name("house_year.csv"), newline="") as file:
-            rows = list(csv.DictReader(file))
-        times = np.array([float(row["time_s"]) for row in rows])
-        columns = {"T_out": "T_out_degC", "sun": "I_sol_W_m2", "price": "price_EUR_kWh"}
-        data = {n: (times, [float(row[c]) for row in rows]) for n, c in columns.items()}
-        with HouseEnv() as env:
-            env.reset(seed=0)
-            snapshot = env.save_state()
-        envs = vector_of(HouseEnv, N)
-        actions = np.random.default_rng(0).uniform(0, 1, (N, 96, 1)).astype(np.float32)
-        plain = envs.rollout(snapshot, actions)
-        assert rows_of(envs.rollout(snapshot, actions, data=data)) == rows_of(plain)
-
     @pytest.mark.parametrize("way", WAYS)
     def test_equals_an_environment_whose_data_that_is(self, way, environments):
         """A policy, too, which reads forecasts; of two equal series one is exchanged."""
@@ -179,17 +162,6 @@ class TestOffsets:
         assert shift[..., 0] == pytest.approx(np.full((N, STEPS), 2.5), abs=1e-5)
         assert not shift[..., 1:].any()
         assert rows_of(envs.rollout(snapshot, pushes())) == rows_of(plain)
-
-    def test_are_the_same_in_all_ways(self, vector_of):
-        results = []
-        for way in WAYS:
-            envs = vector_of(Track, 2, **WAYS[way])
-            envs.reset(seed=3)
-            actions = np.full((2, 6, 1), 0.01, np.float32)
-            found = envs.rollout(None, actions, offsets={"q": 0.1})
-            assert found.observations.tolist() != envs.rollout(None, actions).observations.tolist()
-            results.append(rows_of(found))
-        assert results[0] == results[1] == results[2] == results[3]
 
     @pytest.mark.parametrize(
         ("offsets", "reason"),

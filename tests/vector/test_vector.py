@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
+    CART_POLE,
     IDS,
+    each_mode,
     each_way,
     fixture_outside,  # noqa: F401  # the fixture "outside"
     in_each_mode,
@@ -14,6 +16,8 @@ from vector_tools import (
     run_side_by_side,
     sampled_actions,
 )
+
+from fmugym.vector import FMUVectorEnv
 
 
 @in_each_mode({"env_id": IDS})
@@ -29,6 +33,13 @@ def test_each_environment_is_what_it_is_alone(env_id, mode, hooks, outside):
     rtol = 1e-7 if "Pendulum" in env_id else 0.0  # numpy's powers of arrays and of scalars
     assert run_side_by_side(ours, theirs, 120, rtol=rtol) >= 20
     assert hooks != "auto" or not outside, "the pool starts all episodes"
+
+
+@each_mode
+def test_threads_change_nothing(mode):
+    options = {"max_episode_steps": 7, "autoreset_mode": mode}
+    ours, theirs = (FMUVectorEnv(CART_POLE, 2000, threads=n, **options) for n in (1, 4))
+    assert run_side_by_side(ours, theirs, 25) > 2000
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")

@@ -78,39 +78,16 @@ def test_the_callers_array_is_not_done(hooks, pair):
 
 
 @each_kind
-def test_snapshots_have_done(hooks, pair):
-    ours, theirs = pair(Faulty, hooks, AutoresetMode.DISABLED)
-    for envs in ours, theirs:
-        envs.reset(seed=1)
-    rng = np.random.default_rng(0)
-    for _ in range(8):
-        actions = (rng.random(6) < 0.3).astype(np.int64)
-        result, _ = ours.step(actions), theirs.step(actions)
-        ended = result[2] | result[3]
-        mine, other = (envs.save_state() for envs in (ours, theirs))
-        before = ours.get_attr("done")
-        assert before == theirs.get_attr("done")
-        if ended.any():
-            for envs in ours, theirs:
-                envs.reset(options={"reset_mask": ended})
-        assert not any(ours.get_attr("done"))
-        for envs, snapshot in ((ours, other), (theirs, mine)):
-            envs.restore_state(snapshot)
-            assert envs.get_attr("done") == before
-        if ended.any():
-            for envs in ours, theirs:
-                envs.reset(options={"reset_mask": ended})
-
-
-@each_kind
-def test_rollouts_leave_done(hooks, make_envs):
+def test_rollouts_leave_done_and_snapshots_have_it(hooks, make_envs):
     envs = make_envs(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
     envs.reset(seed=0)
     while not any(done := envs.get_attr("done")):
         envs.step(np.ones(4, np.int64))
     candidate = envs.save_state(int(np.argmin(done)))
     envs.rollout(candidate, np.ones((8, 30), np.int64))
-    assert envs.get_attr("done") == done
+    other = make_envs(CART_POLE, 4, hooks="per_env")
+    other.restore_state(envs.save_state())
+    assert envs.get_attr("done") == other.get_attr("done") == done
 
 
 @each_kind

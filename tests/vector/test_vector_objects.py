@@ -230,17 +230,6 @@ def test_observations_of_one_environment_after_another_are_new_arrays(make_envs)
     assert (np.abs(again) < 2.0).all()
 
 
-class LowPass:
-    """A filter that is shared by all who refer to it."""
-
-    def __init__(self):
-        self.value = 0.0
-
-    def __call__(self, new):
-        self.value = self.value + 0.1 * (new - self.value)
-        return self.value
-
-
 FILTER, RECORD, STEPS = LowPass(), [], 0
 
 

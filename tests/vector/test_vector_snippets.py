@@ -281,11 +281,15 @@ def test_a_table_is_the_array_that_it_stands_for():
         ("np.maximum.reduce([self.state[0], self.state[1]])", "numpy.array around a list"),
         ("np.sum(np.ones((600, 2)) @ self.state, axis=0)", "it multiplies large matrices"),
         ("np.linalg.norm(self.state)", "it uses numpy.linalg.norm without one axis"),
+        ("return 1.0 if self.state[0] > 0 else 0.0", "branches on a value"),
+        ("self.worst = self.state[0]\nreturn self.worst", "changes self.worst"),
+        ("self.state[0] > np.array([1.0, 2.0])", "operands could not be broadcast|shape mismatch"),
+        (Q, "a flag is no Boolean"),
     ],
 )
-def test_what_is_refused_says_why(prototype, body, reason):
-    env = prototype[0]
-    env._reward_policy = hook_of(body).__get__(env)
+def test_what_is_refused_says_why(prototype, body, reason, monkeypatch):
+    env, name = prototype[0], "_is_truncated" if "flag" in reason else "_reward_policy"
+    monkeypatch.setattr(env, name, hook_of(body).__get__(env))
     prepare_hooks(env)
     (why,) = trace_hooks(env).left.values()
     assert re.search(reason, why), why

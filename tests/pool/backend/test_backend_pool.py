@@ -14,9 +14,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import run_side_by_side
 
 import fmugym
-from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, SimulationError
+from fmugym import ConfigError, FMI2CSEnv, FMUVectorEnv, SimulationError
 from fmugym.fmi import Status
-from fmugym.pool import BackendPool, Paced, PoolSpec
+from fmugym.pool import Paced
 from fmugym.pool.backend import backend_pool as backend_module
 from fmugym.pool.backend.clocks import ManualClock
 
@@ -488,38 +488,11 @@ def test_hooks_of_several_real_plants(hooks, mode):
     assert run_side_by_side(ours, theirs, 40) > 9
 
 
-# What of the contract of pools test_pool.py does not show with FMPy in the place of rigs.
-
-
-class TestPool:
-    @pytest.fixture
-    def pool(self, opened):
-        fmu = FMU(PENDULUM)
-        spec = PoolSpec(
-            (fmu.variable("tau"),), tuple(map(fmu.variable, ("q", "q_dot"))), 0.05, num_observed=2
-        )
-        return opened(BackendPool(fmu, spec, 3, [Oscillator() for _ in range(3)]))
-
-    def test_its_own_arrays(self, pool):
-        pool.reset((FMU(PENDULUM).variable("q_0"),), np.zeros((1, 3)))
-        pool.inputs[:] = [[0.0, 0.1, 0.2]]
-        assert pool.step_own() == 0
-        np.testing.assert_array_equal(pool.observations, pool.outputs.T.astype(np.float32))
-        assert len(set(pool.outputs[1])) == 3
-
-    def test_closed(self, pool):
-        pool.close()
-        for call in (pool.step, lambda: pool.reset((), np.zeros((0, 3)))):
-            with pytest.raises(SimulationError, match="the pool is closed"):
-                call()
-
-    def test_warm_up_with_the_inputs_at_their_start_values(self):
-        rig = Oscillator()
-        env = RigEnv(rig, warm_up=0.3)
-        observation, _ = env.reset()
-        np.testing.assert_allclose(observation[0], 0.5 * np.cos(0.3 * OMEGA), atol=1e-6)
-        assert rig.calls == ["reset", "step", "step", "step"]
-        env.close()
+def test_warm_up_with_the_inputs_at_their_start_values(make):
+    rig = Oscillator()
+    observation, _ = make(rig, warm_up=0.3).reset()
+    np.testing.assert_allclose(observation[0], 0.5 * np.cos(0.3 * OMEGA), atol=1e-6)
+    assert rig.calls == ["reset", "step", "step", "step"]
 
 
 # Real time, on a clock that stands still.
