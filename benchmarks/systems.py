@@ -205,7 +205,7 @@ def _container(folder: Path, model: Model) -> Path:
     from container_tools import container
 
     own = [*model.outputs, model.input, *(name for name, _ in model.starts)]
-    names = [(one, variable) for variable in own for one in NAMES]
+    names = {f"{one}.{variable}": (one, variable) for variable in own for one in NAMES}
     path: Path = container(folder, model.path, NAMES, model.links, names, model.step)
     return path
 
