@@ -142,7 +142,8 @@ class Subject:
         self.pool.step_own()
 
     def step(self):
-        self.pool.step(np.zeros((len(self.pool.inputs), self.n)), self.mask())
+        inputs = np.zeros((len(self.pool.inputs), self.n))
+        self.pool._pool.step(inputs, self.mask(), None)  # as numpy would race with other calls
 
     def reset(self):
         values = self.values.copy()
