@@ -20,6 +20,7 @@ from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "ask_in_a_child",
+    "calls_python",
     "describe_missing",
     "libraries_of",
     "load_globally",
@@ -111,6 +112,14 @@ def stray_libraries(library: Path) -> list[Path]:
         return []
     stray = [needed.path for needed in _needed(library) if needed.path and not needed.found]
     return stray[::-1]
+
+
+def calls_python(library: Path) -> bool:
+    """Whether a library calls the Python of its process, which one thread can do at a time.
+
+    Those that pythonfmu makes do. On any system, the names of imported functions are in the file.
+    """
+    return b"PyGILState_Ensure" in library.read_bytes()
 
 
 def libraries_of(library: Path) -> list[Path]:

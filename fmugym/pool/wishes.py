@@ -25,7 +25,7 @@ class Wishes:
         reset_method: One of ``ResetMethod``; by default the fastest one that gives correct
             results in the trial.
         threads: See ``NativePool``; FMPy has one thread. By default one if instances disturb each
-            other when they run at the same time.
+            other when they run at the same time, or if the FMU calls Python.
         private_libraries: See ``NativePool``; by default True if two instances disturb each other
             in the trial. With FMPy each always has one.
         isolation: ``"process"`` for worker processes, ``"none"`` for this process. By default this

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from fmugym.archive.dependencies import calls_python
 from fmugym.archive.fmu import FMU
 from fmugym.pool.backend.backend_choice import pool_of_backend
 from fmugym.pool.base import Pool
@@ -114,13 +115,17 @@ def _open(plan: Plan, log: logging.Logger) -> SavingPool:
 
 def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
     what, how = (plan.fmu, plan.spec, plan.num_instances, log), plan.how
+    threads = how.threads
+    libraries = (library for _, library in plan.fmu.libraries_in(plan.fmu.extract()))
+    if threads is None and any(map(calls_python, libraries)):
+        threads = 1  # several would spend most of the time with handing Python over
     if not plan.is_isolated:
         private = how.private_libraries
-        return local_pool(*what, threads=how.threads, private_libraries=private)
+        return local_pool(*what, threads=threads, private_libraries=private)
     pool = ProcessPool(
         *what,
         workers=how.workers,
-        threads=how.threads,
+        threads=threads,
         own_files=plan.own_files,
         call_timeout=how.call_timeout,
     )

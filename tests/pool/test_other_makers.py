@@ -14,6 +14,7 @@ from combinations import in_turn
 import fmugym
 from fmugym import errors
 from fmugym.archive.bundled import FMI_VERSIONS, bundled_fmu
+from fmugym.trial import opening
 
 pytestmark = pytest.mark.usefixtures("trials")
 
@@ -112,3 +113,19 @@ def test_what_is_invalid_in_it_does_not_stop(make_fmu):
     """Without a variability, Integers and Booleans are continuous, which the standard forbids."""
     findings = fmugym.FMU(make_fmu("pythonfmu")).description.findings
     assert any("variability" in finding for finding in findings)
+
+
+@pytest.mark.parametrize("name", ["pythonfmu", "pythonfmu3"])
+def test_who_calls_python_is_stepped_by_one_thread(make_fmu, name, make_envs, monkeypatch):
+    """Two would hand the lock of Python over and over, and take eight times as long."""
+    make = functools.partial(MadeEnv, make_fmu(name), name)
+    found = [make_envs(make, 4, **wishes).inside.pool.threads for wishes in ({}, {"threads": 2})]
+    pool = opening.ProcessPool
+
+    def isolated(*arguments, threads, **options):
+        found.append(threads)
+        return pool(*arguments, threads=threads, **options)
+
+    monkeypatch.setattr(opening, "ProcessPool", isolated)
+    make_envs(make, 4, isolation="process", workers=1)
+    assert found == [1, 2, 1]
