@@ -47,14 +47,16 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
         yield other
 
 
-def ideal(document: Mapping[str, Any], of_actuators: Iterable[str] = _OF_ACTUATORS) -> Any:
+def ideal(
+    document: Mapping[str, Any], of_actuators: Iterable[str] = _OF_ACTUATORS
+) -> dict[str, Any]:
     """Return a task's document without its sensors, errors of forecasts and warm-up.
 
     Args:
         document: The document.
         of_actuators: The keys of actuators that are left out, too.
     """
-    ideal = _without(document, ("warm_up",))
+    ideal: dict[str, Any] = _without(document, ("warm_up",))
     agent = document.get("agent", {})
     actions = agent.get("actions", ())
     actions = [actions] if isinstance(actions, str) else actions

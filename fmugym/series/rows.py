@@ -45,12 +45,13 @@ class Infos(NamedTuple):
 
     def numbers(self, *path: str) -> FloatArray:
         """The numbers at a place in the infos, shape (N,); 0 where there are none."""
-        now, last = (_numbers(infos, path, self.num_envs) for infos in (self.of_envs, self.last))
+        now = _numbers(self.of_envs, path, self.num_envs)
+        last = _numbers(self.last, path, self.num_envs) if self.last else now
         return np.where(self.ended, last, now)
 
     def each(self, name: str) -> dict[int, Any]:
         """The values of those environments that have one."""
-        ended = np.flatnonzero(self.ended)
+        ended = {*np.flatnonzero(self.ended).tolist()}
         now = {i: one for i, one in _each(self.of_envs, name).items() if i not in ended}
         return now | _each(self.last, name)
 

@@ -8,8 +8,10 @@ from xml.sax.saxutils import quoteattr
 
 import building
 import fmpy
+import pytest
 
 import fmugym
+from fmugym.archive import ArchiveLimits
 from fmugym.config import FOREIGN
 
 MAJOR_VERSIONS = (1, 2, 3)
@@ -241,6 +243,13 @@ class PlainEnv(fmugym.FMUEnv):
 
     def _is_done(self):
         return False
+
+
+def require_refused(path, match, **limits):
+    """Require that opening and extracting an FMU fails, with a text that names the file."""
+    with pytest.raises(fmugym.FMULoadError, match=match) as caught:
+        fmugym.FMU(path, limits=ArchiveLimits(**limits)).extract()
+    assert Path(path).name in str(caught.value)
 
 
 def grouped(config):
