@@ -288,8 +288,8 @@ class Searching:
         count = 1 if probe.is_same else self.episodes or usual
         agents = {winner.name: winner}
         planners = self._planners(baseline.text, count * len(arenas))
-        tuned = (one.best for one in found.controllers)
-        for other in filter(None, [baseline, *tuned, *planners]):
+        others = (one.best for one in found.controllers)
+        for other in filter(None, [baseline, *others, *planners]):
             agents.setdefault(other.name, other)
         test = judge(agents, arenas, count)
         return self._save(winner, test=test, verdict=verdict(test, probe.limits))
