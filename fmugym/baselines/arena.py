@@ -170,5 +170,5 @@ class Arena:
                 *(controller.moments if has_moments else ()),
             )
             totals = totals + np.where(running, np.stack(values), 0.0)
-            running = running & ~(terminated | truncated)
+            running &= ~(terminated | truncated)
         return totals

@@ -55,9 +55,10 @@ class CMA:
         ranks = math.log((population + 1) / 2) - np.log(np.arange(1, population // 2 + 1))
         self._weights = ranks / ranks.sum()
         mass = 1 / (self._weights @ self._weights)
-        self._fade = (mass + 2) / (n + mass + 5)
-        self._damping = 1 + 2 * max(0.0, math.sqrt((mass - 1) / (n + 1)) - 1) + self._fade
-        self._fades = np.array([[(4 + mass / n) / (n + 4 + 2 * mass / n)], [self._fade]])
+        fade = (mass + 2) / (n + mass + 5)
+        damping = 1 + 2 * max(0.0, math.sqrt((mass - 1) / (n + 1)) - 1) + fade
+        self._pace = fade / damping
+        self._fades = np.array([[(4 + mass / n) / (n + 4 + 2 * mass / n)], [fade]])
         self._gains = np.sqrt(self._fades * (2 - self._fades) * mass)
         self._paths = np.zeros((2, n))
         speed = (n + 2) / 3 if self._is_separable else 1.0
@@ -74,7 +75,7 @@ class CMA:
         Brockhoff and N. Hansen, Genetic and Evolutionary Computation Conference, 2011).
         """
         count, n = self._shape
-        half = self._rng.standard_normal((-(-count // 2), n))
+        half = self._rng.standard_normal(((count + 1) // 2, n))
         self._white = white = np.concatenate([half, -half])[:count]
         self._steps = white * self._root if self._is_separable else white @ self._root
         candidates: FloatArray = self.mean + self.sigma * self._steps
@@ -82,7 +83,7 @@ class CMA:
 
     def tell(self, order: npt.NDArray[np.int64]) -> None:
         """Learn from the order of the candidates, the best one first."""
-        _, places = np.unique(order % -(-len(order) // 2), return_index=True)
+        _, places = np.unique(order % ((len(order) + 1) // 2), return_index=True)
         chosen = order[np.sort(places)][: self._weights.size]
         best, white = self._steps[chosen], self._weights @ self._white[chosen]
         step = self._weights @ best
@@ -90,7 +91,7 @@ class CMA:
         self.mean = mean * min(1.0, norm / max(float(np.linalg.norm(mean)), 1e-300))
         self._paths = (1 - self._fades) * self._paths + self._gains * np.stack([step, white])
         length = float(np.linalg.norm(self._paths[1])) / self._usual_length
-        growth = math.exp(min(1.0, self._fade / self._damping * (length - 1)))
+        growth = math.exp(min(1.0, self._pace * (length - 1)))
         self.sigma = min(growth * self.sigma * self._adapted(best), sigma)
 
     def _adapted(self, best: FloatArray) -> float:

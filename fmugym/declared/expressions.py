@@ -15,9 +15,10 @@ from __future__ import annotations
 import ast
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial, reduce
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -131,6 +132,19 @@ class Expression:
             if isinstance(argument, ast.Name)
         }
 
+    def differences(self, *, or_comparisons: bool = False) -> Iterator[tuple[Any, Any]]:
+        """Both sides of each minus: a name, a number, or None for anything else.
+
+        Args:
+            or_comparisons: Whether to give those of comparisons, too.
+        """
+        for node in ast.walk(self.tree):
+            match node:
+                case ast.BinOp(left, ast.Sub(), right):
+                    yield _name_or_number(left), _name_or_number(right)
+                case ast.Compare(left, _, others) if or_comparisons:
+                    yield from pairwise(map(_name_or_number, (left, *others)))
+
     def value(self, names: Names) -> Value:
         """Make nodes of it.
 
@@ -197,6 +211,15 @@ def _check_size(text: str, tree: ast.expr) -> None:
             f"{shown(text)} is too long: an expression has at most {_MOST_NODES} parts, nested "
             f"{_DEEPEST} times"
         )
+
+
+def _name_or_number(node: ast.expr) -> str | float | None:
+    match node:
+        case ast.Name(name):
+            return name
+        case ast.Constant(int() | float() as number):
+            return float(number)
+    return None
 
 
 class _Evaluation:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator
 
 from fmugym.declared.computed import Value
@@ -73,25 +72,12 @@ def _targets(declared: Declarations) -> dict[str, str]:
     """By set point, the variable that it is for: as declared, or else in a difference somewhere."""
     setpoints = declared.root.child("setpoints").value or {}
     found = {one.setpoint: one.of for one in declared.deviations.values()}
-    for first, second in _pairs(declared):
-        for name, other in ((first, second), (second, first)):
-            if name in setpoints and declared.is_output(other):
-                found.setdefault(name, other)
-    return found
-
-
-def _pairs(declared: Declarations) -> Iterator[tuple[str, str]]:
-    """The names on both sides of differences and comparisons, which have one unit."""
     for expression in declared.expressions:
-        for node in ast.walk(expression.tree):
-            sides: list[ast.expr] = []
-            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
-                sides = [node.left, node.right]
-            elif isinstance(node, ast.Compare):
-                sides = [node.left, *node.comparators]
-            names = [side.id for side in sides if isinstance(side, ast.Name)]
-            if len(names) == 2:
-                yield names[0], names[1]
+        for sides in expression.differences(or_comparisons=True):  # of one unit
+            for name, other in (sides, sides[::-1]):
+                if name in setpoints and declared.is_output(other):
+                    found.setdefault(name, other)
+    return found
 
 
 def _value(naming: Naming, name: str) -> Value | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
@@ -61,23 +60,11 @@ def both_controllers(
 def _pairs(document: Mapping[str, Any], env: Any) -> Iterator[tuple[Any, Any]]:
     """What is measured, and what it shall be: the two sides of a minus in an expression."""
     observed = {*env.observation_names}
-    given = [document.get(section, {}) for section in ("setpoints", "data", "memory")]
+    given = (document.get(section, {}) for section in ("setpoints", "data", "memory"))
     measured = observed.difference(*given)
     for expression in getattr(env, "expressions", ()):
-        for node in ast.walk(expression.tree):
-            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
-                sides = _side(node.left), _side(node.right)
-                for of, setpoint in (sides, sides[::-1]):
-                    is_known = isinstance(setpoint, float) or setpoint in observed
-                    if of in measured and is_known:
-                        yield of, setpoint
-                        break
-
-
-def _side(node: ast.expr) -> str | float | None:
-    match node:
-        case ast.Name(name):
-            return name
-        case ast.Constant(int() | float() as number):
-            return float(number)
-    return None
+        for sides in expression.differences():
+            for of, setpoint in (sides, sides[::-1]):
+                if of in measured and (isinstance(setpoint, float) or setpoint in observed):
+                    yield of, setpoint
+                    break

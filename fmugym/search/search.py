@@ -192,8 +192,7 @@ class Search:
     def _cma(self, agent: Agent) -> CMA:
         """The search for the weights of an agent, which begins with its own ones, or 0."""
         mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
-        sigma = _OF_NETWORKS if agent.hidden else 1.0
-        sigma *= 1.0 if agent.text is None else _OF_CORRECTIONS
+        sigma = _OF_NETWORKS if agent.hidden else _OF_CORRECTIONS if agent.text else 1.0
         population = _MANY if agent.observed else FEW
         return CMA(mean, sigma, population, self._rng, largest=_LARGEST, growth=_GROWTH)
 
@@ -220,10 +219,10 @@ class Search:
 
     def _enter(self, history: Agent, baseline: Agent) -> None:
         """Let classes of policies enter. Linear ones are followed by those that see the past."""
-        network = replace(self.probe.linear, name="network", hidden=16)
+        linear = self.probe.linear
         *linear_ones, network = (
             replace(one, scale=self._scale[:, : one.features])
-            for one in (self.probe.linear, history, network)
+            for one in (linear, history, replace(linear, name="network", hidden=16))
         )
         for text in dict.fromkeys((baseline.text, None)):
             prefix = f"{baseline.name} + " if text else ""

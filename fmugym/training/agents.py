@@ -36,6 +36,7 @@ __all__ = [
     "read_agent",
     "read_facts",
     "save",
+    "write_whole",
 ]
 
 _LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
@@ -81,7 +82,14 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
     model.save(folder / _MODEL)
     if normalization is not None:
         normalization.save(str(folder / _NORMALIZATION))
-    (folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
+    write_whole(folder / FACTS, json.dumps(dict(facts)).encode())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file; the one before stays until this one is complete."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(content)
+    part.replace(path)
 
 
 def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:

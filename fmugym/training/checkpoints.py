@@ -9,7 +9,6 @@ as one that was not interrupted, to the last bit.
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import random
 import shutil
@@ -20,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import FMUGymError, reading, shown
-from fmugym.training.agents import algorithm_of, read_facts
+from fmugym.training.agents import algorithm_of, read_facts, write_whole
 
 __all__ = [
     "CHECKPOINT",
@@ -55,9 +54,8 @@ def save_checkpoint(folder: Path, model: Any, venv: Any, more: dict[str, Any]) -
     state["random"] = _random_states(venv)
     with (place / "state.pkl").open("wb") as file:
         pickle.dump(state, file)
-    new = folder / f"{CHECKPOINT}.new"
-    new.write_text(json.dumps({"folder": place.name, "steps": int(model.num_timesteps)}))
-    os.replace(new, folder / CHECKPOINT)
+    facts = {"folder": place.name, "steps": int(model.num_timesteps)}
+    write_whole(folder / CHECKPOINT, json.dumps(facts).encode())
     for old in folder.glob("checkpoint-*"):
         if old != place:
             shutil.rmtree(old, ignore_errors=True)

@@ -23,7 +23,7 @@ from fmugym.search.policy import Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
 from fmugym.signals import Ignoring
-from fmugym.training.agents import FACTS
+from fmugym.training.agents import FACTS, write_whole
 from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
 from fmugym.training.training import require_new
@@ -268,10 +268,8 @@ class Searching:
             "steps": found.steps,
             **more,
         }
-        (self.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
-        part = self.folder / f"{STATE}.part"
-        part.write_bytes(pickle.dumps(found))
-        part.replace(self.folder / STATE)
+        write_whole(self.folder / FACTS, json.dumps(facts).encode())
+        write_whole(self.folder / STATE, pickle.dumps(found))
         return facts
 
     def _judged(self, winner: Agent) -> dict[str, Any]:

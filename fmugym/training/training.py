@@ -39,6 +39,7 @@ from fmugym.training.agents import (
     policy_with,
     read_facts,
     save,
+    write_whole,
 )
 from fmugym.training.checkpoints import (
     NOTHING_TO_RESUME,
@@ -308,7 +309,7 @@ class _Training:
         if settings.diary is not None:
             (settings.folder / RECORDS).mkdir(exist_ok=True)
             facts["record"] = settings.diary.facts()
-        (settings.folder / TRAINING).write_text(json.dumps(facts), encoding="utf-8")
+        write_whole(settings.folder / TRAINING, json.dumps(facts).encode())
         self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
         self._begin = self._told = self._steps
         self._saved_at = monotonic()
