@@ -92,7 +92,8 @@ def columns_of(env: FMUEnv, which: Which) -> Columns:
 
 def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
     """Values with environments on the last axis, as a new array with them on the first."""
-    return np.array(environments_first(np.asarray(values)[..., which]), order="C")
+    rows: npt.NDArray[Any] = environments_first(np.asarray(values))[which].copy()
+    return rows
 
 
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
