@@ -232,12 +232,12 @@ class NativePool(AskingPool):
             raise found
         return found
 
-    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+    def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
         """See ``SavingPool.save_states``."""
         content = request_save_states(indices, records)
         code, answer = self._open_pool().ask(Request.SAVE_STATES, content)
         if code == Answer.RESULT:
-            states: list[bytes] = answer
+            states: tuple[bytes, ...] = answer
             return states
         raise self._answers.result(code, Reader(answer), Reader.end)
 

@@ -109,7 +109,7 @@ class SavingPool(RetryingPool):
         return self.statuses
 
     @abstractmethod
-    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+    def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
         """Save the states of instances, or the records of their episodes.
 
         Raises:

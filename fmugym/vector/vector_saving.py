@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -86,13 +87,13 @@ def which_of(indices: IndexArray, count: int) -> Which:
 
 def columns_of(env: FMUEnv, which: Which) -> Columns:
     """Copy what hooks read in some environments of a batch, whose prototype this is."""
-    columns = read_columns(env, lambda values: _rows(values, which))
+    columns = read_columns(env, partial(_rows, which))
     return columns | {"pictured": None, "attributes": None}
 
 
-def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
+def _rows(which: Which, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Values with environments on the last axis, as a new array with them on the first."""
-    rows: npt.NDArray[Any] = environments_first(np.asarray(values))[which].copy()
+    rows: npt.NDArray[Any] = environments_first(values)[which].copy()
     return rows
 
 

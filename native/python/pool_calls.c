@@ -190,20 +190,23 @@ static bool take_states(PyObject *sequence, Asking *a) {
     return true;
 }
 
-/* A list of the blocks that are all that was written. */
-static PyObject *list_of(const Writer *writer) {
-    Reader reader = {writer->bytes, writer->bytes + writer->size, NULL};
-    PyObject *list = PyList_New(0);
+/* A tuple of the blocks that are all that was written. */
+static PyObject *tuple_of(const Writer *writer) {
+    Reader reader = {writer->bytes, writer->bytes + writer->size, NULL}, ahead = reader;
+    Py_ssize_t count = 0;
 
-    while (list != NULL && reader.at != reader.end) {
+    for (; ahead.at != ahead.end; count++) {
+        read_block(&ahead);
+    }
+    PyObject *blocks = PyTuple_New(count);
+    for (Py_ssize_t i = 0; blocks != NULL && i < count; i++) {
         const Block block = read_block(&reader);
         PyObject *bytes = PyBytes_FromStringAndSize(block.bytes, (Py_ssize_t)block.size);
-        if (bytes == NULL || PyList_Append(list, bytes) < 0) {
-            Py_CLEAR(list);
+        if (bytes == NULL || PyTuple_SetItem(blocks, i, bytes) < 0) {
+            Py_CLEAR(blocks);
         }
-        Py_XDECREF(bytes);
     }
-    return list;
+    return blocks;
 }
 
 static PyObject *answer_of(const Asking *a) {
@@ -214,7 +217,7 @@ static PyObject *answer_of(const Asking *a) {
         return PyErr_NoMemory();
     }
     return a->request == REQUEST_SAVE_STATES && a->answer == ANSWER_RESULT
-               ? Py_BuildValue("iN", (int)a->answer, list_of(writer))
+               ? Py_BuildValue("iN", (int)a->answer, tuple_of(writer))
                : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }
 
