@@ -27,6 +27,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
+from fmugym.identification.problem import start_between
 from fmugym.identification.simulator import Experiment, median_interval, silent
 from fmugym.logs import Columns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
@@ -196,8 +197,7 @@ class _Plant:
                 f"{name!r} needs a range such as {name}=1..10, got {shown(ends)}; its value is "
                 f"{value:g}, the FMU allows {variable.minimum:g} to {variable.maximum:g}"
             )
-        start = value if low <= value <= high else (low + high) / 2
-        return variable.name, (start, low, high)
+        return variable.name, (start_between(value, low, high), low, high)
 
     def start(self, name: str, output: str | None) -> tuple[str, str | float]:
         """A start value that is fitted, and the output or number that it begins with."""
