@@ -18,7 +18,7 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.series.choice import Episodes, choose
 from fmugym.series.rows import Infos, Outcome, Rows, batched
-from fmugym.series.store import Block, Memory, Store, open_store
+from fmugym.series.store import Memory, Store, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
 
@@ -67,9 +67,9 @@ class _Recorder:
         if steps is not None:
             self._rows.go_on(steps)
         if self._path is not None:
-            self._stores.append(open_store(self._path, self._rows.columns))
+            self._stores.append(open_store(self._path, self._rows.none.columns))
             weakref.finalize(self, self._stores[0].close)
-        self._memory = Memory(self._rows.columns, self._most_rows)
+        self._memory = Memory(self._rows.none, self._most_rows)
         self._stores.append(self._memory)
 
     def add(self, outcome: Outcome, idle: MaskArray, steps: Any) -> None:
@@ -81,24 +81,22 @@ class _Recorder:
         """What the environments have at this moment; see ``Choice.present``."""
         return self._choice.present(self.episodes, self._indices)
 
-    def _add(self, block: Block) -> None:
-        for store in self._stores if len(block) else ():
-            store.add(block)
+    def _add(self, rows: TimeSeries) -> None:
+        for store in self._stores if len(rows) else ():
+            store.add(rows)
 
     @property
     def series(self) -> TimeSeries:
         """What was written down until now."""
         if self._memory is None:
             raise SimulationError("there is no recording before the first reset")
-        block = self._memory.rows()
-        limits = getattr(self.episodes.prototype, "cost_limits", {})
-        return TimeSeries(self._rows.columns, block.values, block.faults, limits, block.texts)
+        return self._memory.rows()
 
     def close(self) -> None:
         """Complete the file; rows that follow are only in memory."""
         for store in self._stores:
             store.close()
-        self._stores = [store for store in self._stores if store is self._memory]
+        self._stores = self._stores[-1:]
 
 
 def _chosen(environments: Iterable[int] | None, count: int) -> Any:

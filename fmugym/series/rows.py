@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from fmugym.archive.texts import text_of
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.series.choice import Choice, Episodes
-from fmugym.series.store import Block
+from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 from fmugym.task.starting import start_time_of
 
@@ -63,11 +64,12 @@ def batched(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(infos: Mapping[str, Any], path: Sequence[str], count: int) -> FloatArray:
-    values = _at(infos, path, None)
-    if values is None:
+    *groups, name = path
+    for group in groups:
+        infos = infos.get(group, {})
+    if name not in infos:
         return np.zeros(count)
-    has = _at(infos, (*path[:-1], f"_{path[-1]}"), True)
-    return np.where(has, np.asarray(values, np.float64), 0.0)
+    return np.where(infos.get(f"_{name}", True), np.asarray(infos[name], np.float64), 0.0)
 
 
 def _each(infos: Mapping[str, Any], name: str) -> dict[int, Any]:
@@ -75,14 +77,6 @@ def _each(infos: Mapping[str, Any], name: str) -> dict[int, Any]:
     if has is None:
         return {}
     return {index: _one(infos[name], index) for index in np.flatnonzero(has).tolist()}
-
-
-def _at(infos: Mapping[str, Any], path: Sequence[str], default: bool | None) -> Any:
-    for name in path:
-        if name not in infos:
-            return default
-        infos = infos[name]
-    return infos
 
 
 def _one(values: Any, index: int) -> Any:
@@ -122,6 +116,9 @@ class Rows:
         every: The number of steps from one row to the next. Rewards and costs in a row are the sums
             since the row before.
         infos: Those of the first reset, which tell the terms of rewards and costs.
+
+    Attributes:
+        none: No rows, with the columns of all that follow.
     """
 
     def __init__(
@@ -141,8 +138,9 @@ class Rows:
         self._steps = np.zeros(count, np.int64)
         self._number = np.full(count, -1, np.int64)
         self._starts: Any = np.zeros(count)
-        self.columns = tuple(self._columns())
-        self._texts = [i for i, one in enumerate(self.columns) if one.kind in TEXT_KINDS]
+        columns, limits = tuple(self._columns()), getattr(episodes.prototype, "cost_limits", {})
+        self.none = TimeSeries(columns, np.empty((0, len(columns))), cost_limits=limits)
+        self._texts = [i for i, one in enumerate(columns) if one.kind in TEXT_KINDS]
 
     def _columns(self) -> Iterator[Quantity]:
         if self._episodes.is_vector:
@@ -162,7 +160,7 @@ class Rows:
         self._steps[:] = steps
         self._number[:] = 0
 
-    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> Block:
+    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> TimeSeries:
         """Make the first rows of episodes."""
         self._number[mask] += 1
         self._steps[mask] = 0
@@ -172,7 +170,7 @@ class Rows:
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations, infos), (no, no), infos)
 
-    def add(self, outcome: Outcome, idle: MaskArray) -> Block:
+    def add(self, outcome: Outcome, idle: MaskArray) -> TimeSeries:
         """Make the rows of a step.
 
         Args:
@@ -210,7 +208,7 @@ class Rows:
         values: FloatArray,
         flags: tuple[MaskArray, MaskArray],
         infos: Infos,
-    ) -> Block:
+    ) -> TimeSeries:
         is_due = mask[self._indices]
         which = self._indices[is_due]
         env = self._episodes.prototype
@@ -232,7 +230,8 @@ class Rows:
             rows[index]: str(why) for index, why in infos.each("fault").items() if index in rows
         }
         table = np.array(parts, np.float64).T
-        return Block(table, told, _texts_in(table[:, self._texts]) if self._texts else {})
+        texts = _texts_in(table[:, self._texts]) if self._texts else {}
+        return replace(self.none, values=table, faults=told, texts=texts)
 
 
 def _texts_in(numbers: FloatArray) -> dict[float, str]:
