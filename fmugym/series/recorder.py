@@ -198,7 +198,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
         infos, seen = Infos(batched(info), 1), _batch(observation)
-        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen, no)
+        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen)
         self._recorder.add(outcome, no, self._recorder.episodes.prototype.step_count - 1)
         return observation, reward, terminated, truncated, info
 
@@ -325,29 +325,25 @@ class RecordVectorSeries(VectorWrapper):
     def _noted(self, actions: Any, result: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         observations, rewards, terminated, truncated, infos = result
         self._envs.actions = np.array(actions)
-        ended, none = terminated | truncated, np.zeros(self.num_envs, np.bool_)
-        same_step = self._mode is AutoresetMode.SAME_STEP and ended.any()
-        idle = self._ended
-        last, seen = Infos(infos, self.num_envs), observations
-        if same_step:
-            last, seen = self._last(infos, observations, ended)
-        at_end = self._at_end if same_step else None
-        outcome = Outcome(rewards, terminated, truncated, last, seen, ended, at_end)
-        self._recorder.add(outcome, idle, self._steps)
-        begun = ended if same_step else idle
-        self._ended = none if same_step else ended
+        begun, ended, told = self._ended, terminated | truncated, Infos(infos, self.num_envs)
+        outcome = Outcome(rewards, terminated, truncated, told, observations)
+        if same_step := self._mode is AutoresetMode.SAME_STEP and ended.any():
+            outcome = outcome._replace(**self._last(infos, observations, ended))
+        self._recorder.add(outcome, begun, self._steps)
+        begun, self._ended = ended if same_step else begun, ended
         if begun.any():
             self._begin(begun, infos, observations)
         return observations, rewards, terminated, truncated, infos
 
-    def _last(self, infos: Any, observations: Any, ended: MaskArray) -> tuple[Infos, Any]:
-        """The infos and observations with which episodes have ended, in the mode SAME_STEP."""
+    def _last(self, infos: Any, observations: Any, ended: MaskArray) -> dict[str, Any]:
+        """With what episodes have ended, as an ``Outcome`` has it, in the mode SAME_STEP."""
         seen = observations
         if isinstance(observations, np.ndarray):
             seen = observations.copy()
             for index in np.flatnonzero(ended).tolist():
                 seen[index] = infos["final_obs"][index]
-        return Infos(infos, self.num_envs, infos["final_info"], ended), seen
+        last = Infos(infos, self.num_envs, infos["final_info"], ended)
+        return {"infos": last, "observations": seen, "last": self._at_end}
 
     def close(self, **kwargs: Any) -> None:
         """Complete the file, and close the environments."""

@@ -161,7 +161,9 @@ def _results(
             *([_cell(str(one.environment))] if several else []),
             _cell(str(one.episode)),
             *figures.cells(one),
-            *(_cell(str(one.steps)), _cell(_duration(one.seconds)), _text(one.end)),
+            _cell(str(one.steps)),
+            _cell(_duration(one.seconds)),
+            _text(one.end),
         ]
         for name, one in rows
     ]

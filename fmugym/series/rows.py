@@ -92,9 +92,8 @@ class Outcome(NamedTuple):
         rewards, terminated, truncated: Shape (N,).
         infos: The infos of the steps, those of steps that ended an episode included.
         observations: Likewise.
-        ended: The environments whose FMU is in the next episode already.
-        last: What those had before, a row for each environment that is written down, as
-            ``Choice.present`` gives it; None if there are no such environments.
+        last: What environments had whose FMU is in the next episode already (``infos.ended``), a
+            row for each that is written down, as ``Choice.present`` gives it; None without such.
     """
 
     rewards: FloatArray
@@ -102,7 +101,6 @@ class Outcome(NamedTuple):
     truncated: MaskArray
     infos: Infos
     observations: Any
-    ended: MaskArray
     last: FloatArray | None = None
 
 
@@ -145,15 +143,16 @@ class Rows:
     def _columns(self) -> Iterator[Quantity]:
         if self._episodes.is_vector:
             yield Quantity("environment", "index")
-        yield from (Quantity("episode", "index"), Quantity("step", "index"))
+        yield Quantity("episode", "index")
+        yield Quantity("step", "index")
         yield Quantity("time", "time", "s")
         yield from self._choice.quantities
         yield Quantity("reward", "reward")
         for path in self._summed:
-            kind = _GROUPS.get(path[0], "cost")
-            yield Quantity(".".join(path), kind)
+            yield Quantity(".".join(path), _GROUPS.get(path[0], "cost"))
         yield from (Quantity(f"{key}.{name}", _TOLD[key]) for key, name in self._told)
-        yield from (Quantity("terminated", "flag"), Quantity("truncated", "flag"))
+        yield Quantity("terminated", "flag")
+        yield Quantity("truncated", "flag")
 
     def go_on(self, steps: Any) -> None:
         """Begin in the middle of episodes that have had so many steps: these have the number 0."""
@@ -183,7 +182,7 @@ class Rows:
         ended = (outcome.terminated | outcome.truncated) & ~idle
         values = self._values(outcome.observations, outcome.infos)
         if outcome.last is not None:
-            begun = outcome.ended[self._indices]
+            begun = outcome.infos.ended[self._indices]
             values[begun, : outcome.last.shape[1]] = outcome.last[begun]
         due = ~idle & (ended | (self._steps % self._every == 0))
         flags = outcome.terminated, outcome.truncated
@@ -216,12 +215,11 @@ class Rows:
         passed: Any = (env.inside.warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
             *([which] if self._episodes.is_vector else []),
-            *(self._number[which], self._steps[which]),
-            *(
-                spec.communication_point(passed, self._starts[which]),
-                *values[is_due].T,
-                *self._sums[which].T,
-            ),
+            self._number[which],
+            self._steps[which],
+            spec.communication_point(passed, self._starts[which]),
+            *values[is_due].T,
+            *self._sums[which].T,
             *(infos.numbers(*path)[which] for path in self._told),
             *(flag[which] for flag in flags),
         ]
