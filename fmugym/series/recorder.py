@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from fmugym.checks import check_count, check_path, number_of
-from fmugym.env import FMUEnv
+from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
@@ -90,7 +90,8 @@ class _Recorder:
         """What was written down until now."""
         if self._memory is None:
             raise SimulationError("there is no recording before the first reset")
-        return self._memory.rows()
+        rows: TimeSeries = self._memory.rows()
+        return rows
 
     def close(self) -> None:
         """Complete the file; rows that follow are only in memory."""
@@ -169,9 +170,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         path: str | os.PathLike[str] | None = None,
         most_rows: int = 1_000_000,
     ) -> None:
-        inner = getattr(env, "unwrapped", None)
-        if not isinstance(inner, FMUEnv):
-            raise ConfigError(f"steps of an FMUEnv can be recorded, got {shown(env)}")
+        inner = inner_env(env)
         super().__init__(env)
         self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows)
 

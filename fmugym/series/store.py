@@ -8,15 +8,12 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.signals import Ignoring, ordinary
 from fmugym.task.quantity import TEXT_KINDS, Quantity
-
-if TYPE_CHECKING:
-    from fmugym.series.timeseries import TimeSeries
 
 __all__ = [
     "FAULT",
@@ -42,9 +39,9 @@ _ROWS_OF_A_GROUP: Final = 20_000
 
 
 class Store(Protocol):
-    """Takes rows."""
+    """Takes rows, in the form of a ``TimeSeries``."""
 
-    def add(self, rows: TimeSeries) -> None:
+    def add(self, rows: Any) -> None:
         """Add rows."""
 
     def close(self) -> None:
@@ -73,12 +70,12 @@ class Memory:
         most_rows: The rows to keep; earlier ones are dropped.
     """
 
-    def __init__(self, start: TimeSeries, most_rows: int) -> None:
+    def __init__(self, start: Any, most_rows: int) -> None:
         self._start, self._most, self._rows = start, most_rows, 0
-        self._blocks: deque[TimeSeries] = deque()
-        self._small: list[TimeSeries] = []
+        self._blocks: deque[Any] = deque()
+        self._small: list[Any] = []
 
-    def add(self, rows: TimeSeries) -> None:
+    def add(self, rows: Any) -> None:
         """Add rows. Small blocks are put together, since each takes memory of its own."""
         self._small.append(rows)
         self._rows += len(rows)
@@ -91,7 +88,7 @@ class Memory:
     def close(self) -> None:
         """Do nothing: rows stay."""
 
-    def rows(self) -> TimeSeries:
+    def rows(self) -> Any:
         """All rows that are kept."""
         return self._start.joined([*self._blocks, *self._small])
 
@@ -112,7 +109,7 @@ class CsvStore:
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._writer.writerow([*map(heading, columns), FAULT])
 
-    def add(self, rows: TimeSeries) -> None:
+    def add(self, rows: Any) -> None:
         """See ``Store``."""
         columns = [cells.tolist() for cells in rows.cells()]
         for number, row in enumerate(zip(*columns, strict=True)):
@@ -140,7 +137,7 @@ class ParquetStore:
         self._file = path.open("xb")
         self._schema = self._arrow.schema([*map(self._field, columns), (FAULT, "string")])
         self._writer = parquet.ParquetWriter(self._file, self._schema)
-        self._waiting: list[TimeSeries] = []
+        self._waiting: list[Any] = []
         self._rows = 0
 
     def _field(self, column: Quantity) -> Any:
@@ -149,7 +146,7 @@ class ParquetStore:
         kind = "int64" if column.kind in WHOLE else kind
         return self._arrow.field(column.name, self._arrow.type_for_alias(kind), metadata=facts)
 
-    def add(self, rows: TimeSeries) -> None:
+    def add(self, rows: Any) -> None:
         """See ``Store``."""
         self._waiting.append(rows)
         self._rows += len(rows)
