@@ -10,6 +10,7 @@ from functools import partial
 from importlib import import_module
 from typing import Any, ClassVar, Final, Never
 
+import gymnasium
 import numpy as np
 from gymnasium import logger as gymnasium_logger
 
@@ -44,6 +45,7 @@ __all__ = [
     "FMI3CSEnv",
     "FMI3MEEnv",
     "FMUEnv",
+    "inner_env",
 ]
 
 _ARGUMENTS: Final = (
@@ -465,6 +467,19 @@ class FMUEnv(Constructed):
     def __reduce__(self) -> tuple[Callable[[], FMUEnv], tuple[()]]:
         args, kwargs = self._constructor_arguments
         return partial(type(self), *args, **kwargs), ()
+
+
+def inner_env(env: Any) -> FMUEnv:
+    """The environment of fmugym inside of wrappers.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    inner = env.unwrapped if isinstance(env, gymnasium.Env) else env
+    if not isinstance(inner, FMUEnv):
+        got = f"the class {inner.__name__}" if isinstance(inner, type) else type(inner).__name__
+        raise ConfigError(f"expected an environment of fmugym, got {got}")
+    return inner
 
 
 class FMI1CSEnv(FMUEnv):

@@ -23,10 +23,11 @@ import numpy as np
 
 from fmugym.archive.units import conversion_between
 from fmugym.archive.variable import Variable
-from fmugym.env import FMUEnv
+from fmugym.env import inner_env
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
+from fmugym.identification.problem import start_between
 from fmugym.identification.simulator import Experiment, median_interval, silent
 from fmugym.logs import Columns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
@@ -85,7 +86,7 @@ def fit_logs(
         SimulationError: If the FMU fails with the start values or near a tried point.
     """
     with closing(make_env()) as env:
-        plant = _Plant(env.unwrapped, dict(columns or {}))
+        plant = _Plant(env, dict(columns or {}))
         trajectories = [one for log in logs for one in plant.trajectories(log)]
         if not trajectories:
             raise ConfigError("there is no log to fit to")
@@ -129,10 +130,8 @@ class _Plant:
     """The task's side of a fit: names, units, and what is given."""
 
     def __init__(self, env: Any, columns: dict[str, str]) -> None:
-        if not isinstance(env, FMUEnv):
-            raise ConfigError(f"expected an environment of fmugym, got {shown(env)}")
-        self.env, self._columns = env, columns
-        draws = env.inside.draws
+        self.env, self._columns = inner_env(env), columns
+        draws = self.env.inside.draws
         typical = np.median(draws.draw_starts(np.random.default_rng(0), 101), axis=1).tolist()
         pairs = zip(draws.model_variables, typical, strict=True)
         given = {v.name: value for v, value in pairs if not is_start_time(v)}
@@ -196,8 +195,7 @@ class _Plant:
                 f"{name!r} needs a range such as {name}=1..10, got {shown(ends)}; its value is "
                 f"{value:g}, the FMU allows {variable.minimum:g} to {variable.maximum:g}"
             )
-        start = value if low <= value <= high else (low + high) / 2
-        return variable.name, (start, low, high)
+        return variable.name, (start_between(value, low, high), low, high)
 
     def start(self, name: str, output: str | None) -> tuple[str, str | float]:
         """A start value that is fitted, and the output or number that it begins with."""

@@ -11,7 +11,6 @@ actions that write the logged inputs.
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import re
@@ -25,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.units import conversion_between
+from fmugym.archive.units import Conversion, conversion_between
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, require_regular
 from fmugym.declared import Task
@@ -363,16 +362,16 @@ class Columns:
     def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:
         self._columns, self._data = log.columns, _section(env, "data")
         self._variables = env.fmu.description.variables
-        self._from: dict[str, tuple[str, float, float]] = {}
+        self._from: dict[str, tuple[str, Conversion]] = {}
         for column in log.columns:
             name, unit = declared_as(env, columns.get(column, column))
             if name in self._variables:
                 own, units = self._variables[name].unit, env.fmu.description.units
                 try:
                     to_log = conversion_between(own, log.units.get(column) or unit, units)
+                    self._from[name] = column, to_log
                 except ConfigError as error:
                     raise ConfigError(f"column {column!r} of the log: {error}") from None
-                self._from[name] = column, 1.0 / to_log.factor, -to_log.offset / to_log.factor
 
     def has(self, variable: Variable) -> bool:
         """Whether the log has a column for this variable."""
@@ -386,15 +385,15 @@ class Columns:
     def range_of(self, variable: Variable) -> float:
         """How far apart the values of a variable are; 1 if they are all the same."""
         self.require(variable)
-        column, factor, _ = self._from[variable.name]
-        values = self._columns[column]
+        column, to_log = self._from[variable.name]
+        values = to_log.inverse(self._columns[column])
         known = values[~np.isnan(values)]
-        return float(np.ptp(known) * abs(factor) if known.size else 0.0) or 1.0
+        return float(np.ptp(known) if known.size else 0.0) or 1.0
 
     def values(self, variable: Variable, part: PlantLog) -> FloatArray:
         """The values of a variable in the rows of an episode, which must be finite."""
-        column, factor, offset = self._from[variable.name]
-        values = part.columns[column] * factor + offset
+        column, to_log = self._from[variable.name]
+        values = to_log.inverse(part.columns[column])
         wrong = ~np.isfinite(values)
         if wrong.any():
             raise ConfigError(
@@ -415,16 +414,15 @@ class Columns:
 
     def of(self, *variables: Variable) -> list[str]:
         """The names of the columns of variables, as far as there are some."""
-        found = [self._from.get(variable.name) for variable in variables]
-        return [one[0] for one in found if one is not None]
+        return [self._from[variable.name][0] for variable in variables if self.has(variable)]
 
     def rows(self, part: PlantLog, time_step: float) -> tuple[FloatArray, list[dict[str, float]]]:
         """The communication points of an episode, and the values of the variables there."""
         count = int((part.times[-1] - part.times[0]) / time_step + 1e-6)
         times = part.times[0] + np.arange(count + 1) * time_step
         values = {
-            name: self._at(name, part, column, times) * factor + offset
-            for name, (column, factor, offset) in self._from.items()
+            name: to_log.inverse(self._at(name, part, column, times))
+            for name, (column, to_log) in self._from.items()
         }
         rows = np.transpose([*values.values()]).tolist()
         return times, [dict(zip(values, row, strict=True)) for row in rows]
@@ -528,13 +526,11 @@ def _candidates(space: spaces.Space[Any]) -> list[Any]:
         return _corners(space)
     if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         raise ConfigError(f"a log can be played with actions of numbers, not of {space}")
-    counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
-    pairs = zip(np.ravel(space.start).tolist(), np.ravel(counts).tolist(), strict=True)
-    ranges = [range(first, first + count) for first, count in pairs]
-    if math.prod(map(len, ranges)) > _MOST_ACTIONS:
+    counts = np.ravel(space.n if isinstance(space, spaces.Discrete) else space.nvec).tolist()
+    if math.prod(counts) > _MOST_ACTIONS:
         raise ConfigError(f"{space} has more than {_MOST_ACTIONS} actions, too many to try out")
-    shape, dtype = space.shape, space.dtype
-    return [np.array(one, dtype).reshape(shape)[()] for one in itertools.product(*ranges)]
+    places = (np.reshape(place, np.shape(space.start)) for place in np.ndindex(*counts))
+    return [(space.start + place).astype(space.dtype)[()] for place in places]
 
 
 def _corners(space: spaces.Box) -> list[Any]:

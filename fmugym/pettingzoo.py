@@ -5,7 +5,7 @@ Needs the extra ``pettingzoo``. See ``docs/systems.md``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -241,9 +241,7 @@ def _agents_of(
     description = env.fmu.description
     if not isinstance(description, SystemDescription):
         raise ConfigError(f"{env.fmu.path.name} is no system; say which agents there are")
-    owner_of = _owners(env, description)
-    owners = {name: owner_of(name) for name in (*actions, *observations)}
-    components = dict.fromkeys(owner for name in actions if (owner := owners[name]))
+    owners = {name: _owner(env, description, name) for name in (*actions, *observations)}
     own = [name for name in actions if owners[name] == _ALL]
     if own:
         raise ConfigError(
@@ -254,25 +252,19 @@ def _agents_of(
             [name for name in actions if owners[name] == component],
             [name for name in observations if owners[name] in {component, _ALL}],
         )
-        for component in components
+        for component in dict.fromkeys(owners[name] for name in actions)
     }
 
 
-def _owners(env: FMUEnv, description: SystemDescription) -> Callable[[str], str]:
-    """A function that tells the component of a name, or ``_ALL``."""
-    names = list(description.variables)
-    components = [component.name for component in description.plan.components]
-
-    def owner_of(name: str) -> str:
-        if isinstance(env, TaskEnv):
-            alias = env.task.root.child("variables").child(name).child("name").value
-            name = name if alias is None else alias
-        if name not in description.variables:
-            return _ALL
-        parts = {end.part for end in description.ends[names.index(name)]}
-        return components[parts.pop()] if len(parts) == 1 else _ALL
-
-    return owner_of
+def _owner(env: FMUEnv, description: SystemDescription, name: str) -> str:
+    """The component of a name, or ``_ALL``."""
+    if isinstance(env, TaskEnv):
+        name = env.task.root.child("variables").child(name).child("name").value or name
+    if name not in description.variables:
+        return _ALL
+    place = list(description.variables).index(name)
+    parts = {end.part for end in description.ends[place]}
+    return description.plan.components[parts.pop()].name if len(parts) == 1 else _ALL
 
 
 def _require_one_each(agents: Mapping[str, Any], actions: Sequence[str]) -> None:

@@ -31,7 +31,7 @@ from gymnasium.spaces.utils import flatdim, flatten, unflatten
 from gymnasium.utils.seeding import np_random
 
 from fmugym.checks import check_seed
-from fmugym.env import FMUEnv
+from fmugym.env import inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.signals import ordinary
 from fmugym.task.saving import generator_of, row_of, state_of
@@ -192,7 +192,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)
-        self._inner = _inner(env)
+        self._inner = inner_env(env)
         self._start: dict[str, Any] | None = None
         self._rows: list[tuple[Any, ...]] = []
 
@@ -282,7 +282,7 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
     Raises:
         ConfigError: If the FMU or the config is another one.
     """
-    inner, now = _inner(env), surroundings()
+    inner, now = inner_env(env), surroundings()
     require_scope(recording.scope, scope_of(inner), "recording")
     then = recording.surroundings
     others = {n: (then.get(n, ""), now[n]) for n in now if then.get(n) != now[n]}
@@ -331,13 +331,6 @@ def _difference(what: str, found: Any, recorded: Any) -> str:
     values = np.ravel(found)[index], np.ravel(recorded)[index]
     where = f"[{index}]" if found.ndim else ""
     return f"{what}{where} is {values[0]!r}, recorded was {values[1]!r}"
-
-
-def _inner(env: Any) -> FMUEnv:
-    inner = getattr(env, "unwrapped", None)
-    if not isinstance(inner, FMUEnv):
-        raise ConfigError(f"episodes of an FMUEnv can be recorded, got {shown(env)}")
-    return inner
 
 
 def _stream_of(generator: np.random.Generator) -> tuple[int, ...]:

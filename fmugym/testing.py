@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium.utils.env_checker import data_equivalence
 
 from fmugym.checks import has_method
-from fmugym.env import FMUEnv
+from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, ContractError, FMUGymError, shown
 from fmugym.vector.hooks.check import CURE, find_difference
 
@@ -66,7 +66,7 @@ def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 
         ContractError: If the environment breaks the contract; the text says how.
         ConfigError: If it is not an environment of fmugym.
     """
-    inner = _of_this_package(env)
+    inner = inner_env(env)
     actions = _sample_actions(inner, seed, num_steps)
     for check in _CHECKS:
         check(inner, actions, seed)
@@ -90,21 +90,13 @@ def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any)
         raise ConfigError(f"expected a class or a function, got {shown(make_env)}")
     env = make_env(**kwargs)
     try:
-        inner = _of_this_package(env)
+        inner = inner_env(env)
         difference = find_difference(inner)
     finally:
         if has_method(env, "close"):
             env.close()
     if difference is not None:
         raise ContractError(f"{type(inner).__name__}: {difference}. {CURE}")
-
-
-def _of_this_package(env: gymnasium.Env[Any, Any]) -> FMUEnv:
-    inner = env.unwrapped if isinstance(env, gymnasium.Env) else env
-    if not isinstance(inner, FMUEnv):
-        got = f"the class {inner.__name__}" if isinstance(inner, type) else type(inner).__name__
-        raise ConfigError(f"expected an environment of fmugym, got {got}")
-    return inner
 
 
 def _sample_actions(env: FMUEnv, seed: int, count: int) -> list[Any]:

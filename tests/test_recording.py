@@ -136,7 +136,7 @@ class TestRefusals:
                 replay(recording, other)
 
     def test_of_other_environments(self):
-        with pytest.raises(ConfigError, match="FMUEnv"):
+        with pytest.raises(ConfigError, match="environment of fmugym, got CartPoleEnv"):
             Recorder(gymnasium.make("CartPole-v1"))
 
     def test_before_the_first_reset(self):

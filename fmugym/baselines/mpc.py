@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
 from time import perf_counter
 from typing import Any, Final, NamedTuple
@@ -111,7 +111,8 @@ class MPC(Controller):
         if model is not None and not callable(model):
             raise ConfigError(f"model must be a function, got {shown(model)}")
         self.model = model
-        self._copies: FMUVectorEnv | None = None
+        self._copies: Any = None
+        """The copies; the first nine run beside an environment, and all try plans."""
 
     def bind(self, env: Any, names: Any = None) -> MPC:
         """See ``Controller.bind``.
@@ -143,7 +144,6 @@ class MPC(Controller):
         self._many = max(COPIES, self.candidates // self.rounds)
         self._copies = FMUVectorEnv(make, self._many, autoreset_mode="Disabled")
         self._prototype = self._copies.inside.prototype
-        self._cost_limits = getattr(self._prototype, "cost_limits", {})
         future = self._prototype.inside.future or Future({}, (), float)
         for name in self.states:
             self._check_signal("states", name)
@@ -151,7 +151,7 @@ class MPC(Controller):
         self._require_fit(future)
         self._foresight = _Foresight(self.names, future, self.time_step, steps)
         self._warm = self._bound_warm()
-        self._slopes: FloatArray | None = None
+        self._slopes: Any = None
 
     def _sides(self) -> list[FloatArray]:
         """The lowest and the highest numbers of an action."""
@@ -161,12 +161,6 @@ class MPC(Controller):
         if not np.isfinite(sides).all():
             raise ConfigError("MPC needs actions with limits: give their variables 'min' and 'max'")
         return sides
-
-    @property
-    def _copied(self) -> FMUVectorEnv:
-        """The copies; the first nine run beside an environment, and all try plans."""
-        assert self._copies is not None
-        return self._copies
 
     def _model_of(self) -> Callable[[], Any]:
         """What makes copies."""
@@ -184,7 +178,7 @@ class MPC(Controller):
 
     def _require_fit(self, future: Future) -> None:
         """Refuse a model of another task, a horizon beyond the data, and states beside data."""
-        copied = self._copied
+        copied = self._copies
         names = attribute_of(copied, "observation_names") or self.names
         space = copied.single_action_space
         if (names, space) != (self.names, self.space):
@@ -206,11 +200,9 @@ class MPC(Controller):
 
     def _bound_warm(self) -> list[Controller]:
         """The simple controllers, bound to the copies."""
-        declared = self._prototype.inside.controllers
-        found = [] if self.warm is None else [self.warm]
-        if self.warm is None and declared is not None:
-            found = declared()
-        return [one.bind(self._copied, self.names) for one in found]
+        declared = self._prototype.inside.controllers or list
+        found = declared() if self.warm is None else [self.warm]
+        return [one.bind(self._copies, self.names) for one in found]
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if mask.all():
@@ -219,12 +211,14 @@ class MPC(Controller):
             self._episodes[index] = None
 
     def _decide(self, rows: FloatArray) -> FloatArray:
-        decided = [self._decide_one(index, row) for index, row in enumerate(rows)]
-        return np.array(decided)
+        return np.array([self._decide_one(index, row) for index, row in enumerate(rows)])
 
     def _decide_one(self, index: int, row: FloatArray) -> FloatArray:
         begin = perf_counter()
-        with _single(self._env, index) as env:
+        single = (
+            self._env.inside.engine.single(index) if self._is_vector else nullcontext(self._env)
+        )
+        with single as env:
             future = env.inside.future
             now = 0.0 if future is None else float(future.clock(env))
             known = self._episodes[index]
@@ -234,7 +228,7 @@ class MPC(Controller):
                 self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
-        with self._copied.inside.episodes.assuming(data):
+        with self._copies.inside.episodes.assuming(data):
             best = self._search(episode, start, assumed, row)
         episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
         for name, paid in best.costs.items():
@@ -254,7 +248,7 @@ class MPC(Controller):
 
     def _begun(self, env: FMUEnv) -> _Episode:
         """Begin an episode of the copies; the first one has the nominal parameters."""
-        copied, episode = self._copied, _Episode()
+        copied, episode = self._copies, _Episode()
         values = spread(self._prototype, self.seed)
         if self._prototype.config.draws_start_time:
             values["start_time"] = np.full(COPIES, env.time - env.step_count * self.time_step)
@@ -282,15 +276,14 @@ class MPC(Controller):
 
     def _measured(self, env: FMUEnv) -> npt.NDArray[np.bool_]:
         """Which elements of the observation were measured now, and do not hold or lie ahead."""
-        assert self._slopes is not None
         is_held = np.isin([*self._prototype.out], [*env.inside.held()])
-        return self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1)
+        return np.asarray(self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1))
 
     def _follow(self, episode: _Episode, action: Any, row: FloatArray, now: float) -> None:
         """Let the copies do the step that the environment has done, with what was observed."""
         if episode.have_ended:
             return
-        copied = self._copied
+        copied = self._copies
         data = self._foresight.observed(episode.row, row, now)
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
@@ -308,7 +301,7 @@ class MPC(Controller):
 
     def _find_slopes(self, snapshot: Snapshot) -> FloatArray:
         """How present values of the observation follow the outputs, shape (k, o)."""
-        copied = self._copied
+        copied = self._copies
         action = self._actions(np.full((1, *self._plan_shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
         plain = seen().observations[0, 0].astype(np.float64)
@@ -327,7 +320,6 @@ class MPC(Controller):
             return self._env.save_state(*([[index]] if self._is_vector else [])), {}, {}
         if self.states:
             return self._moved(episode, row), {}, {"seed": self.seed}
-        assert self._slopes is not None
         slopes = self._slopes * episode.is_measured[:, np.newaxis]
         wanted = (row - episode.seen) @ np.linalg.pinv(slopes, rcond=1e-6).T
         episode.observer.correct(wanted, slopes.any(axis=0))
@@ -346,7 +338,7 @@ class MPC(Controller):
         values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
         nominal = {n: float(v[0]) for n, v in spread(self._prototype, self.seed).items()}
-        copied = self._copied
+        copied = self._copies
         seed = self.seed + episode.steps
         copied.reset(seed=seed, options={"model_parameters": nominal | starts})
         episode.snapshot, episode.have_ended = copied.save_state(), False
@@ -395,7 +387,7 @@ class MPC(Controller):
         plans: FloatArray,
     ) -> _Plan:
         """The best of some plans; whatever goes beyond the limit of a cost counts far more."""
-        found = self._copied.rollout(start, self._actions(plans), **assumed)
+        found = self._copies.rollout(start, self._actions(plans), **assumed)
         values: FloatArray = found.rewards.sum(axis=1)
         for name, limit in limits.items():
             if name in found.costs:
@@ -411,7 +403,7 @@ class MPC(Controller):
         left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
             name: max(0.0, most - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
-            for name, most in self._cost_limits.items()
+            for name, most in getattr(self._prototype, "cost_limits", {}).items()
         }
 
     def _first_plans(
@@ -431,7 +423,7 @@ class MPC(Controller):
             actions.append(chosen[turn, np.arange(self._many)])
             return actions[-1]
 
-        self._copied.rollout(start, policy, horizon=self._plan_shape[0], **assumed)
+        self._copies.rollout(start, policy, horizon=self._plan_shape[0], **assumed)
         chosen = np.array(actions, np.float64).reshape(*self._plan_shape[:1], self._many, -1)
         plans = (chosen - self._low) / (self._high - self._low)
         return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
@@ -567,19 +559,9 @@ class _Foresight:
         found = {}
         for name in self._lookups:
             places = [place for ahead, place in self._known[name] if ahead == 0]
-            values = [before[places[0]], row[places[0]]] if places else [self._means[name]] * 2
+            values = np.array([before, row])[:, places[0]] if places else [self._means[name]] * 2
             found[name] = [now - self._time_step, now], values
         return found
-
-
-@contextmanager
-def _single(env: Any, index: int) -> Iterator[FMUEnv]:
-    """An environment, or one of many."""
-    if not hasattr(env, "num_envs"):
-        yield env
-        return
-    with env.inside.engine.single(index) as one:
-        yield one
 
 
 def _pairs(states: Mapping[str, str] | str | None) -> dict[str, str]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fmugym.checks import check_integer, check_mapping, check_number, check_text
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.checks import check_integer, check_mapping, check_number, check_option, check_text
+from fmugym.errors import ConfigError, shown
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
 
@@ -44,9 +44,7 @@ class Comparison:
         Raises:
             ConfigError: If the output was not measured.
         """
-        known, output = self.trajectories[0].outputs, check_text("output", output)
-        if output not in known:
-            raise unknown_name("measured output", output, known)
+        output = check_option("measured output", output, self.trajectories[0].outputs)
         pairs = zip(self.simulated, self.trajectories, strict=True)
         return [simulated[output] - measured.outputs[output] for simulated, measured in pairs]
 
@@ -128,10 +126,8 @@ def _chosen(comparison: Comparison, outputs: Sequence[str] | None) -> list[str]:
         return list(comparison.trajectories[0].outputs)
     if not isinstance(outputs, list | tuple) or not outputs:
         raise ConfigError(f"outputs must be a list of names, not {shown(outputs)}")
-    names = [check_text("outputs", output) for output in outputs]
-    for name in names:
-        comparison.residuals(name)  # refuses an unknown name
-    return names
+    known = comparison.trajectories[0].outputs
+    return [check_option("measured output", output, known) for output in outputs]
 
 
 def _draw_output(ax: Axes, comparison: Comparison, output: str) -> None:

@@ -80,13 +80,12 @@ class FitResult:
     @property
     def standard_errors(self) -> dict[str, float]:
         """Standard errors by name; infinite for a value that the data do not determine."""
-        errors = np.sqrt(np.diag(self.covariance)).tolist()
-        return dict(zip(self.values, errors, strict=True))
+        return dict(zip(self.values, self._errors.tolist(), strict=True))
 
     @property
     def correlation_matrix(self) -> FloatArray:
         """Correlations of the values, in their order, shape (k, k); 0 for undetermined ones."""
-        errors = np.sqrt(np.diag(self.covariance))
+        errors = self._errors
         known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
         scaled = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
         return np.asarray(scaled / np.outer(known, known))
@@ -158,12 +157,10 @@ class FitResult:
         count, seed = check_integer("count", count, 1, 10**6), check_seed(seed)
         widths, center = self._widths(), np.array([*self.values.values()])
         bounded = np.isfinite(widths)
-        for name, error, has_ends in zip(
-            self.values, self.standard_errors.values(), bounded, strict=True
-        ):
-            if not (has_ends or np.isfinite(error)):
+        scales = np.where(bounded, widths, self._errors)
+        for name, scale in zip(self.values, scales, strict=True):
+            if not np.isfinite(scale):
                 raise ConfigError(f"{name!r} has no distribution: give it bounds")
-        scales = np.where(bounded, widths, np.sqrt(np.diag(self.covariance)))
         told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, GUESS, 0.0))
         amounts, directions = np.linalg.eigh(told)
         root = directions / np.sqrt(amounts)
@@ -173,6 +170,10 @@ class FitResult:
             drawn = center + rng.standard_normal((count, len(center))) @ root.T * scales
             kept = np.vstack([kept, drawn[((low <= drawn) & (drawn <= high)).all(axis=1)]])
         return kept[:count]
+
+    @property
+    def _errors(self) -> FloatArray:
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def _widths(self) -> FloatArray:
         return np.array([high - low for low, high in self.bounds.values()])

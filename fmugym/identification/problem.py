@@ -31,7 +31,7 @@ from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.starting import start_variable
 
-__all__ = ["Limits", "Problem"]
+__all__ = ["Limits", "Problem", "start_between"]
 
 Limits = float | tuple[float, float] | tuple[float, float, float]
 
@@ -387,7 +387,7 @@ def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
     if len(numbers) == 1:
         numbers = (*numbers, variable.minimum, variable.maximum)
     elif len(numbers) == 2:
-        numbers = (_start_between(variable, *numbers), *numbers)
+        numbers = (start_between(variable.start_number, *numbers), *numbers)
     is_ordered = len(numbers) == 3 and numbers[1] <= numbers[0] <= numbers[2] > numbers[1]
     if not (is_ordered and np.isfinite(numbers[0])):
         raise ConfigError(
@@ -406,10 +406,9 @@ def _settable(experiment: Experiment, name: str) -> Variable:
     return variable
 
 
-def _start_between(variable: Variable, low: float, high: float) -> float:
-    if low <= variable.start_number <= high:
-        return variable.start_number
-    return (low + high) / 2
+def start_between(value: float, low: float, high: float) -> float:
+    """A value, or the middle of a range that it is not in."""
+    return value if low <= value <= high else (low + high) / 2
 
 
 def _counted(trajectory: Trajectory, experiment: Experiment) -> MaskArray:

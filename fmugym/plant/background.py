@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from contextlib import suppress
-from typing import Final
-
-from fmugym.signals import ordinary
+from typing import Any, Final
 
 __all__ = ["Background"]
 
@@ -27,44 +25,29 @@ class Background:
         error: What the coroutine has raised, or None.
     """
 
-    def __init__(self, make: Callable[[], Awaitable[None]], name: str) -> None:
-        self.error: Exception | None = None
-        self._make, self._is_ready = make, threading.Event()
+    def __init__(self, make: Callable[[], Coroutine[Any, Any, None]], name: str) -> None:
+        self.error: BaseException | None = None
+        self._loop = asyncio.new_event_loop()
+        self._task = self._loop.create_task(make())
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
-        self._is_ready.wait()
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the coroutine has ended."""
-        return not self._thread.is_alive()
 
     def _run(self) -> None:
-        with suppress(asyncio.CancelledError):
-            asyncio.run(self._main())
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(asyncio.wait([self._task]))
+            self.error = None if self._task.cancelled() else self._task.exception()
 
-    async def _main(self) -> None:
-        self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
-        self._is_ready.set()
-        try:
-            await self._make()
-        except ordinary(Exception) as error:
-            self.error = error
-
-    def _cancel(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-
-    def join(self, seconds: float) -> None:
-        """Wait for its end, for some time."""
+    def join(self, seconds: float) -> bool:
+        """Wait for its end, for some time; tells whether it has come."""
         self._thread.join(seconds)
+        return not self._thread.is_alive()
 
     def stop(self) -> None:
         """Cancel the coroutine, and wait for its end.
 
         Libraries lose cancellations: ``asyncio.wait_for`` does so until Python 3.12.
         """
-        while not self.is_over:
+        while not self.join(0.0):
             with suppress(RuntimeError):  # the loop is closed
-                self._loop.call_soon_threadsafe(self._cancel)
-            self._thread.join(_JOIN_SECONDS)
+                self._loop.call_soon_threadsafe(self._task.cancel)
+            self.join(_JOIN_SECONDS)

@@ -74,15 +74,14 @@ class Feed:
     def row(self) -> dict[str, float]:
         """What the FMU's variables have at this tick, in its units, by name."""
         return {
-            tag.variable.name: tag.to_task.inverse(self.values[name][0])
+            tag.own: tag.to_task.inverse(self.values[name][0])
             for name, tag in self.plant.tags.items()
-            if tag.variable
+            if tag.own
         }
 
     def held(self) -> list[str]:
         """The names of the FMU's variables whose last values go on."""
-        tags = self.plant.tags.values()
-        return [tag.variable.name for tag in tags if tag.variable and tag.name in self.faults]
+        return [tag.own for name, tag in self.plant.tags.items() if name in self.faults]
 
     def told(self) -> str:
         """What is wrong, in words; tags of which the same is wrong stand together."""
@@ -151,9 +150,10 @@ class Feed:
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""
-        for name, tag in self.plant.tags.items():
-            if strange := tag.misfit(self.values[name][0]):
-                raise ConfigError(f"the plant at {self.plant.address}: {name}: {strange}")
+        found = {n: tag.misfit(self.values[n][0]) for n, tag in self.plant.tags.items()}
+        self.faults = {name: strange for name, strange in found.items() if strange}
+        if self.faults:
+            raise ConfigError(self._told())
 
     def advance(self) -> None:
         """Wait for the next tick; what was read until then becomes present."""
@@ -202,13 +202,12 @@ class Feed:
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
         """What a step gives of its readings, a row for each."""
         how = self.plant.tags[name].sampling
-        found = numbers[-1] if how == "last" else _SAMPLED[how](numbers, axis=0)
-        if how == "integral":
-            found = found * self.plant.step
+        found = _SAMPLED[how](numbers, axis=0) * (self.plant.step if how == "integral" else 1.0)
         return tuple(found.tolist())
 
 
 _SAMPLED: Final[Mapping[str, Callable[..., Any]]] = {
+    "last": lambda rows, axis: rows[-1],
     "mean": np.mean,
     "integral": np.mean,
     "min": np.min,

@@ -34,8 +34,6 @@ _KINDS: Final = {
 }
 """The functions that read, by what they read: their codes, and the library's names."""
 
-_BITS: Final = ("coil", "discrete")
-
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
 
 
@@ -50,7 +48,7 @@ class _Place(NamedTuple):
 
     @property
     def is_bits(self) -> bool:
-        return self.kind in _BITS
+        return self.kind in ("coil", "discrete")
 
     @classmethod
     def of(cls, plant: Plant, tag: Tag) -> _Place:

@@ -20,7 +20,7 @@ from cryptography import x509
 
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
-from fmugym.plant.polling import Answer, RefusedError, Values
+from fmugym.plant.polling import Answer, CertificateError, Values
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
 from fmugym.signals import Ignoring
@@ -67,7 +67,8 @@ class PlantClient:
         pinned = self._plant["server_certificate"]
         if pinned is not None:
             text = f"its certificate is not that of {shown(pinned)}"
-            self._client.certificate_validator = await _only(pinned, partial(RefusedError, text))
+            only = await _only(pinned, partial(CertificateError, text))
+            self._client.certificate_validator = only
         await self._client.set_security(
             SecurityPolicyBasic256Sha256, _content(certificate), _content(key)
         )

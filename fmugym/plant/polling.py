@@ -18,10 +18,10 @@ from fmugym.signals import ordinary
 
 __all__ = [
     "Answer",
+    "CertificateError",
     "Client",
     "LostError",
     "Poller",
-    "RefusedError",
     "Round",
     "Values",
     "protocol_of",
@@ -34,15 +34,15 @@ _MOST: Final = 10_000
 
 
 _REFUSALS: Final = ("Certificate", "Security", "Identity", "UserAccess")
-"""Words in the names of errors of a server that refuses a client."""
+"""Words in the names of errors of a server that refuses a client, or is refused."""
 
 
 class LostError(FMUGymError):
     """The server is not there, or does not answer."""
 
 
-class RefusedError(LostError):
-    """The server does not want this client, or this client does not want the server."""
+class CertificateError(LostError):
+    """This client does not want the server."""
 
 
 class Answer(NamedTuple):
@@ -134,11 +134,10 @@ class Poller:
 
     def _note(self, error: Exception) -> None:
         name = type(error).__name__
-        refuses = any(word in name for word in _REFUSALS)
-        what = "it refuses this client" if refuses else "it does not answer"
+        self.is_refused = any(word in name for word in _REFUSALS)
+        what = "it refuses this client" if self.is_refused else "it does not answer"
         is_own = isinstance(error, LostError)
         self._trouble = str(error) if is_own else f"{what}: {name} {error}".strip()
-        self.is_refused = refuses or isinstance(error, RefusedError)
 
     async def _converse(self, connection: AsyncExitStack) -> None:
         async with asyncio.timeout(self._timeout):

@@ -137,7 +137,8 @@ class _Twin:
         before, after = self._before[tag.name], self._after[tag.name]
         if tag.sampling != "last":
             return (after,)  # that of the whole step
-        one, is_real = self._quantities[tag.name], not tag.variable or tag.variable.kind == "real"
+        one = self._quantities[tag.name]
+        is_real = not tag.own or self.env.fmu.variable(tag.own).kind == "real"
         moves = is_real and not one.holds and one.kind in ("output", "data")
         return (before + part * (after - before) if moves else before,)
 
@@ -192,9 +193,8 @@ class Server:
         self.address = ""
         self.summary: Callable[[], Summary]
         self._background = Background(self._serve, "plant server")
-        while not (self.address or self._background.is_over):
-            self._background.join(0.01)
-        self._raise()
+        while not (self.address or self.wait(0.01)):
+            pass
 
     async def _serve(self) -> None:
         env: Any = self._player.make_env(lambda **form: environment(self._task, **form))
@@ -211,23 +211,19 @@ class Server:
                     is_over = twin.passed >= most
                     twin.values()
 
-    def _raise(self) -> None:
-        error = self._background.error
+    def wait(self, seconds: float) -> bool:
+        """Wait for the end, for some real time; tells whether it has come.
+
+        Raises:
+            SimulationError: If the FMU or the server has failed.
+        """
+        is_over, error = self._background.join(seconds), self._background.error
         if isinstance(error, FMUGymError):
             raise error
         if error is not None:
             where = f"port {self._port} of the loopback" if self._port else "the loopback"
             raise SimulationError(f"the server at {where} has failed: {error}") from error
-
-    def wait(self, seconds: float) -> bool:
-        """Wait for the end, for some real time; tells whether it has come.
-
-        Raises:
-            SimulationError: If the FMU has failed.
-        """
-        self._background.join(seconds)
-        self._raise()
-        return self._background.is_over
+        return is_over
 
     def close(self) -> None:
         """End the server; more than one call is fine."""

@@ -27,12 +27,6 @@ from fmugym.pool.backend.clocks import Clock, RealClock
 __all__ = ["Shadow", "connect"]
 
 
-def _watched(task: Task, feed: Feed) -> Task:
-    """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
-    task = on_time_of_year(endless(task), feed)
-    return replace(task, document=ideal(task.document, DEVICE))
-
-
 def _with_past(task: Task) -> Task:
     """The task with a warm-up that fills histories, if the agent sees some."""
     agent = task.root.child("agent")
@@ -136,7 +130,8 @@ def connect(
     """
     task, clock = Task.of(config), clock or RealClock()
     feed = Feed(clock)
-    watched = _watched(task, feed)
+    watched = on_time_of_year(endless(task), feed)
+    watched = replace(watched, document=ideal(watched.document, DEVICE))  # the plant's own devices
     own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
         env = stack.enter_context(closing(environment(own, backend=feed)))

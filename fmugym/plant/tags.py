@@ -31,7 +31,7 @@ class Tag:
         conversion: From the plant's number to the unit of the task.
         count: How many numbers there are.
         low, high: The limits of the task, infinite where there are none.
-        variable: That of the FMU which the task writes or reads; None for time and data.
+        own: The name in the FMU, if the task writes or reads it there; "" for time and data.
         to_task: From the FMU's unit to that of the task.
         sampling: What of its readings within a step counts.
     """
@@ -43,14 +43,13 @@ class Tag:
     count: int = 1
     low: float = -math.inf
     high: float = math.inf
-    variable: Variable | None = None
+    own: str = ""
     to_task: Conversion = IDENTITY
     sampling: str = "last"
 
     def of_fmu(self, values: Mapping[str, Any]) -> Any:
         """Its value in the unit of the task, of the FMU's values by name."""
-        assert self.variable is not None
-        return self.to_task(values[self.variable.name])
+        return self.to_task(values[self.own])
 
     def misfit(self, number: float) -> str:
         """What is strange about a number, which a wrong type would make; "" if nothing is."""
@@ -90,7 +89,7 @@ class Plant:
     def of(self, variables: Iterable[Variable]) -> list[Tag]:
         """The tags of some of the FMU's variables."""
         names = {one.name for one in variables}
-        return [tag for tag in self.tags.values() if tag.variable and tag.variable.name in names]
+        return [tag for tag in self.tags.values() if tag.own in names]
 
     def require(self, variable: Variable, name: str = "") -> None:
         """Refuse a plant without a tag for a variable that the task needs, by its name there."""
@@ -147,7 +146,7 @@ def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
         if one.name == own:
             to_task = conversion_between(one.unit, unit, env.fmu.description.units)
             sampling = "median" if one in spec.inputs else one.sampling
-            return {"variable": one, "to_task": to_task, "sampling": sampling}
+            return {"own": own, "to_task": to_task, "sampling": sampling}
     return {}
 
 

@@ -25,14 +25,23 @@ from fmugym.task.quantity import Quantity
 __all__ = ["COLOURS", "as_svg", "drawing_style", "plot", "svg_of"]
 
 COLOURS: Final = (
-    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f", "#882255"),
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#e69f00",
+    "#56b4e9",
+    "#7f7f7f",
+    "#882255",
 )
 """Colours that people with colour blindness can tell apart: Okabe and Ito, 2008, and two more."""
 
 _BAND: Final = "#0072b2"
 _LIMIT: Final = "#b00020"
 _UNITS_OF_TIME: Final = (
-    *((3 * 86400, 86400, "days"), (3 * 3600, 3600, "hours"), (600, 60, "minutes")),
+    (3 * 86400, 86400, "days"),
+    (3 * 3600, 3600, "hours"),
+    (600, 60, "minutes"),
 )
 _MOST_LINES: Final = 8
 _MOST_POINTS: Final = 4_000
@@ -183,7 +192,7 @@ def _panels(series: TimeSeries) -> list[_Panel]:
     targets = {column.name for column in seen}
     free = [one for one in setpoints if one.of not in targets]
     guided = {one.of for one in setpoints}
-    panels = [_panel(c.unit, [c], setpoints) for c in seen if c.name in guided]
+    panels = [_panel([c], setpoints) for c in seen if c.name in guided]
     panels += _by_unit([c for c in seen if c.name not in guided])
     panels += _by_unit([*free, *series.of_kind("data")])
     panels += _by_unit(series.of_kind("action"))
@@ -200,26 +209,25 @@ def _by_unit(columns: Sequence[Quantity]) -> list[_Panel]:
     for column in columns:
         groups.setdefault(column.unit or f"\0{column.name}", []).append(column)
     return [
-        _panel(unit, group[begin : begin + _MOST_LINES])
-        for unit, group in groups.items()
+        _panel(group[begin : begin + _MOST_LINES])
+        for group in groups.values()
         for begin in range(0, len(group), _MOST_LINES)
     ]
 
 
-def _panel(unit: str, group: Sequence[Quantity], setpoints: Sequence[Quantity] = ()) -> _Panel:
-    names = {column.name for column in group}
-    own = tuple(one for one in setpoints if one.of in names)
-    label = group[0].name if len(group) == 1 else ""
-    if unit and not unit.startswith("\0"):
-        label = f"{label} in {unit}" if label else unit
-    return _Panel(label, tuple(group), own)
+def _panel(group: Sequence[Quantity], setpoints: Sequence[Quantity] = ()) -> _Panel:
+    """A panel for one column and its set points, or for several of one unit."""
+    one, *others = group
+    label = f"{one.name} in {one.unit}" if one.unit else one.name
+    own = tuple(setpoint for setpoint in setpoints if setpoint.of == one.name)
+    return _Panel(one.unit if others else label, tuple(group), own)
 
 
 def _draw(axis: Any, panel: _Panel, series: TimeSeries, times: Any) -> None:
     for colour, column in zip(COLOURS, panel.columns, strict=False):
-        values = series[column.name]
-        values = np.nancumsum(values) if panel.summed else values
-        label = column.name.rpartition(".")[2] if panel.summed else column.name
+        values, label = series[column.name], column.name
+        if panel.summed:
+            values, label = np.nancumsum(values), label.rpartition(".")[2]
         style = {"color": colour, "drawstyle": _drawstyle(column)}
         axis.plot(*_thinned(times, values), label=_plain(label), **style)
     for setpoint in panel.setpoints:

@@ -12,13 +12,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from fmugym.checks import check_count, check_path, number_of
-from fmugym.env import FMUEnv
+from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.series.choice import Episodes, choose
 from fmugym.series.rows import Infos, Outcome, Rows, batched
-from fmugym.series.store import Block, Memory, Store, open_store
+from fmugym.series.store import Memory, Store, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
 
@@ -67,9 +67,9 @@ class _Recorder:
         if steps is not None:
             self._rows.go_on(steps)
         if self._path is not None:
-            self._stores.append(open_store(self._path, self._rows.columns))
+            self._stores.append(open_store(self._path, self._rows.none.columns))
             weakref.finalize(self, self._stores[0].close)
-        self._memory = Memory(self._rows.columns, self._most_rows)
+        self._memory = Memory(self._rows.none, self._most_rows)
         self._stores.append(self._memory)
 
     def add(self, outcome: Outcome, idle: MaskArray, steps: Any) -> None:
@@ -81,24 +81,23 @@ class _Recorder:
         """What the environments have at this moment; see ``Choice.present``."""
         return self._choice.present(self.episodes, self._indices)
 
-    def _add(self, block: Block) -> None:
-        for store in self._stores if len(block) else ():
-            store.add(block)
+    def _add(self, rows: TimeSeries) -> None:
+        for store in self._stores if len(rows) else ():
+            store.add(rows)
 
     @property
     def series(self) -> TimeSeries:
         """What was written down until now."""
         if self._memory is None:
             raise SimulationError("there is no recording before the first reset")
-        block = self._memory.rows()
-        limits = getattr(self.episodes.prototype, "cost_limits", {})
-        return TimeSeries(self._rows.columns, block.values, block.faults, limits, block.texts)
+        rows: TimeSeries = self._memory.rows()
+        return rows
 
     def close(self) -> None:
         """Complete the file; rows that follow are only in memory."""
         for store in self._stores:
             store.close()
-        self._stores = [store for store in self._stores if store is self._memory]
+        self._stores = self._stores[-1:]
 
 
 def _chosen(environments: Iterable[int] | None, count: int) -> Any:
@@ -171,9 +170,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         path: str | os.PathLike[str] | None = None,
         most_rows: int = 1_000_000,
     ) -> None:
-        inner = getattr(env, "unwrapped", None)
-        if not isinstance(inner, FMUEnv):
-            raise ConfigError(f"steps of an FMUEnv can be recorded, got {shown(env)}")
+        inner = inner_env(env)
         super().__init__(env)
         self._recorder = _Recorder(_One(inner), variables, None, every, path, most_rows)
 
@@ -200,7 +197,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
         infos, seen = Infos(batched(info), 1), _batch(observation)
-        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen, no)
+        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen)
         self._recorder.add(outcome, no, self._recorder.episodes.prototype.step_count - 1)
         return observation, reward, terminated, truncated, info
 
@@ -327,29 +324,25 @@ class RecordVectorSeries(VectorWrapper):
     def _noted(self, actions: Any, result: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         observations, rewards, terminated, truncated, infos = result
         self._envs.actions = np.array(actions)
-        ended, none = terminated | truncated, np.zeros(self.num_envs, np.bool_)
-        same_step = self._mode is AutoresetMode.SAME_STEP and ended.any()
-        idle = self._ended
-        last, seen = Infos(infos, self.num_envs), observations
-        if same_step:
-            last, seen = self._last(infos, observations, ended)
-        at_end = self._at_end if same_step else None
-        outcome = Outcome(rewards, terminated, truncated, last, seen, ended, at_end)
-        self._recorder.add(outcome, idle, self._steps)
-        begun = ended if same_step else idle
-        self._ended = none if same_step else ended
+        begun, ended, told = self._ended, terminated | truncated, Infos(infos, self.num_envs)
+        outcome = Outcome(rewards, terminated, truncated, told, observations)
+        if same_step := self._mode is AutoresetMode.SAME_STEP and ended.any():
+            outcome = outcome._replace(**self._last(infos, observations, ended))
+        self._recorder.add(outcome, begun, self._steps)
+        begun, self._ended = ended if same_step else begun, ended
         if begun.any():
             self._begin(begun, infos, observations)
         return observations, rewards, terminated, truncated, infos
 
-    def _last(self, infos: Any, observations: Any, ended: MaskArray) -> tuple[Infos, Any]:
-        """The infos and observations with which episodes have ended, in the mode SAME_STEP."""
+    def _last(self, infos: Any, observations: Any, ended: MaskArray) -> dict[str, Any]:
+        """With what episodes have ended, as an ``Outcome`` has it, in the mode SAME_STEP."""
         seen = observations
         if isinstance(observations, np.ndarray):
             seen = observations.copy()
             for index in np.flatnonzero(ended).tolist():
                 seen[index] = infos["final_obs"][index]
-        return Infos(infos, self.num_envs, infos["final_info"], ended), seen
+        last = Infos(infos, self.num_envs, infos["final_info"], ended)
+        return {"infos": last, "observations": seen, "last": self._at_end}
 
     def close(self, **kwargs: Any) -> None:
         """Complete the file, and close the environments."""

@@ -8,21 +8,16 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from html import escape
+from itertools import starmap
 from statistics import fmean
 from typing import Final
 
 from fmugym.checks import check_path
 from fmugym.series.intervals import confidence
 from fmugym.series.plots import as_svg
-from fmugym.series.summary import (
-    Course,
-    EpisodeSummary,
-    TextCourse,
-    courses,
-    summaries,
-    text_courses,
-)
+from fmugym.series.summary import FIGURES, EpisodeSummary, courses, summaries, text_courses
 from fmugym.series.timeseries import TimeSeries
+from fmugym.task.quantity import Quantity
 
 __all__ = ["write_report"]
 
@@ -166,7 +161,9 @@ def _results(
             *([_cell(str(one.environment))] if several else []),
             _cell(str(one.episode)),
             *figures.cells(one),
-            *(_cell(str(one.steps)), _cell(_duration(one.seconds)), _text(one.end)),
+            _cell(str(one.steps)),
+            _cell(_duration(one.seconds)),
+            _text(one.end),
         ]
         for name, one in rows
     ]
@@ -179,22 +176,21 @@ class _Figures:
     """The columns that episodes and means over them have: the reward, its terms, costs, KPIs."""
 
     def __init__(self, episodes: Sequence[EpisodeSummary], limits: Mapping[str, float]) -> None:
-        self._terms, self._costs, self._kpis = (
-            list(dict.fromkeys(name for one in episodes for name in getattr(one, group)))
-            for group in ("terms", "costs", "kpis")
-        )
-        self._limits = limits
-        costs = [f"{n} (at most {limits[n]:g})" if n in limits else n for n in self._costs]
-        self.header = ["reward", *self._terms, *costs, *self._kpis]
+        columns = dict.fromkeys(column for one in episodes for column in one.figures)
+        self._limits: dict[Quantity, float] = {}
+        self.header = ["reward"]
+        for column in sorted(columns, key=lambda column: FIGURES.index(column.kind)):
+            name = column.name.partition(".")[2]
+            limit = limits.get(name, math.inf) if column.kind == "cost term" else math.inf
+            self._limits[column] = limit
+            self.header.append(f"{name} (at most {limit:g})" if limit < math.inf else name)
 
     def cells(self, one: EpisodeSummary, kind: str = "") -> Iterator[str]:
         """The cells of one row; the kind is that of its reward."""
         yield _cell(_number(one.reward), kind)
-        yield from (_cell(_number(one.terms.get(name))) for name in self._terms)
-        for name in self._costs:
-            value = one.costs.get(name, math.nan)
-            yield _cell(_number(value), "bad" if value > self._limits.get(name, math.inf) else "")
-        yield from (_cell(_number(one.kpis.get(name))) for name in self._kpis)
+        for column, limit in self._limits.items():
+            value = one.figures.get(column, math.nan)
+            yield _cell(_number(value), "bad" if value > limit else "")
 
 
 def _means(found: Mapping[str, Sequence[EpisodeSummary]], figures: _Figures) -> str:
@@ -226,15 +222,10 @@ def _mean(episodes: Sequence[EpisodeSummary]) -> EpisodeSummary:
     return replace(
         episodes[0],
         reward=fmean(one.reward for one in episodes),
-        terms=_means_by_name([one.terms for one in episodes]),
-        costs=_means_by_name([one.costs for one in episodes]),
-        kpis=_means_by_name([one.kpis for one in episodes]),
+        figures={
+            column: fmean(one.figures[column] for one in episodes) for column in episodes[0].figures
+        },
     )
-
-
-def _means_by_name(dicts: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    names = {name for one in dicts for name in one}
-    return {name: fmean(one[name] for one in dicts if name in one) for name in names}
 
 
 def _episodes(series: TimeSeries, prefix: str) -> Iterator[str]:
@@ -244,13 +235,16 @@ def _episodes(series: TimeSeries, prefix: str) -> Iterator[str]:
         yield f"<h3>{where}</h3>" if len(episodes) > 1 else ""
         picture = _inline(as_svg(one), f"{prefix}-{number}")
         yield f"<figure>{picture}<figcaption>{_CAPTION}</figcaption></figure>"
-        rows = [_course(course) for course in courses(one)]
+        rows = [
+            [_text(column.name, "first"), _text(column.unit), *map(_cell, map(_number, numbers))]
+            for column, numbers in courses(one)
+        ]
         header = ["variable", "unit", "least", "mean", "most", "last", "mean distance to set point"]
         opened = "" if len(episodes) > 1 else " open"
         table = _table(header, rows)
         yield f"<details{opened}><summary>Variables in numbers</summary>{table}</details>"
-        if texts := list(text_courses(one)):
-            table = _table(["String", "text", "first at", "share"], list(map(_texts, texts)))
+        if rows := list(starmap(_texts, text_courses(one))):
+            table = _table(["String", "text", "first at", "share"], rows)
             yield f"<details{opened}><summary>Strings</summary>{table}</details>"
     if len(episodes) > _MOST_PICTURES:
         yield f'<p class="soft">{len(episodes) - _MOST_PICTURES} more episodes are not drawn.</p>'
@@ -261,15 +255,9 @@ def _inline(svg: str, prefix: str) -> str:
     return _IDS.sub(rf"\g<1>{prefix}-", svg)
 
 
-def _course(course: Course) -> list[str]:
-    unit = _text(course.quantity.unit)
-    numbers = course.least, course.mean, course.most, course.last, course.deviation
-    return [_text(course.quantity.name, "first"), unit, *(_cell(_number(n)) for n in numbers)]
-
-
-def _texts(course: TextCourse) -> list[str]:
-    name, text = _text(course.name, "first"), _text(course.text)
-    return [name, text, _cell(_duration(course.begin)), _cell(f"{100 * course.share:.3g} %")]
+def _texts(name: str, text: str, begin: float, share: float) -> list[str]:
+    cells = _cell(_duration(begin)), _cell(f"{100 * share:.3g} %")
+    return [_text(name, "first"), _text(text), *cells]
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from fmugym.archive.texts import text_of
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.series.choice import Choice, Episodes
-from fmugym.series.store import Block
+from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 from fmugym.task.starting import start_time_of
 
@@ -63,11 +64,12 @@ def batched(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(infos: Mapping[str, Any], path: Sequence[str], count: int) -> FloatArray:
-    values = _at(infos, path, None)
-    if values is None:
+    *groups, name = path
+    for group in groups:
+        infos = infos.get(group, {})
+    if name not in infos:
         return np.zeros(count)
-    has = _at(infos, (*path[:-1], f"_{path[-1]}"), True)
-    return np.where(has, np.asarray(values, np.float64), 0.0)
+    return np.where(infos.get(f"_{name}", True), np.asarray(infos[name], np.float64), 0.0)
 
 
 def _each(infos: Mapping[str, Any], name: str) -> dict[int, Any]:
@@ -75,14 +77,6 @@ def _each(infos: Mapping[str, Any], name: str) -> dict[int, Any]:
     if has is None:
         return {}
     return {index: _one(infos[name], index) for index in np.flatnonzero(has).tolist()}
-
-
-def _at(infos: Mapping[str, Any], path: Sequence[str], default: bool | None) -> Any:
-    for name in path:
-        if name not in infos:
-            return default
-        infos = infos[name]
-    return infos
 
 
 def _one(values: Any, index: int) -> Any:
@@ -98,9 +92,8 @@ class Outcome(NamedTuple):
         rewards, terminated, truncated: Shape (N,).
         infos: The infos of the steps, those of steps that ended an episode included.
         observations: Likewise.
-        ended: The environments whose FMU is in the next episode already.
-        last: What those had before, a row for each environment that is written down, as
-            ``Choice.present`` gives it; None if there are no such environments.
+        last: What environments had whose FMU is in the next episode already (``infos.ended``), a
+            row for each that is written down, as ``Choice.present`` gives it; None without such.
     """
 
     rewards: FloatArray
@@ -108,7 +101,6 @@ class Outcome(NamedTuple):
     truncated: MaskArray
     infos: Infos
     observations: Any
-    ended: MaskArray
     last: FloatArray | None = None
 
 
@@ -122,6 +114,9 @@ class Rows:
         every: The number of steps from one row to the next. Rewards and costs in a row are the sums
             since the row before.
         infos: Those of the first reset, which tell the terms of rewards and costs.
+
+    Attributes:
+        none: No rows, with the columns of all that follow.
     """
 
     def __init__(
@@ -141,28 +136,30 @@ class Rows:
         self._steps = np.zeros(count, np.int64)
         self._number = np.full(count, -1, np.int64)
         self._starts: Any = np.zeros(count)
-        self.columns = tuple(self._columns())
-        self._texts = [i for i, one in enumerate(self.columns) if one.kind in TEXT_KINDS]
+        columns, limits = tuple(self._columns()), getattr(episodes.prototype, "cost_limits", {})
+        self.none = TimeSeries(columns, np.empty((0, len(columns))), cost_limits=limits)
+        self._texts = [i for i, one in enumerate(columns) if one.kind in TEXT_KINDS]
 
     def _columns(self) -> Iterator[Quantity]:
         if self._episodes.is_vector:
             yield Quantity("environment", "index")
-        yield from (Quantity("episode", "index"), Quantity("step", "index"))
+        yield Quantity("episode", "index")
+        yield Quantity("step", "index")
         yield Quantity("time", "time", "s")
         yield from self._choice.quantities
         yield Quantity("reward", "reward")
         for path in self._summed:
-            kind = _GROUPS.get(path[0], "cost")
-            yield Quantity(".".join(path), kind)
+            yield Quantity(".".join(path), _GROUPS.get(path[0], "cost"))
         yield from (Quantity(f"{key}.{name}", _TOLD[key]) for key, name in self._told)
-        yield from (Quantity("terminated", "flag"), Quantity("truncated", "flag"))
+        yield Quantity("terminated", "flag")
+        yield Quantity("truncated", "flag")
 
     def go_on(self, steps: Any) -> None:
         """Begin in the middle of episodes that have had so many steps: these have the number 0."""
         self._steps[:] = steps
         self._number[:] = 0
 
-    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> Block:
+    def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> TimeSeries:
         """Make the first rows of episodes."""
         self._number[mask] += 1
         self._steps[mask] = 0
@@ -172,7 +169,7 @@ class Rows:
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations, infos), (no, no), infos)
 
-    def add(self, outcome: Outcome, idle: MaskArray) -> Block:
+    def add(self, outcome: Outcome, idle: MaskArray) -> TimeSeries:
         """Make the rows of a step.
 
         Args:
@@ -185,7 +182,7 @@ class Rows:
         ended = (outcome.terminated | outcome.truncated) & ~idle
         values = self._values(outcome.observations, outcome.infos)
         if outcome.last is not None:
-            begun = outcome.ended[self._indices]
+            begun = outcome.infos.ended[self._indices]
             values[begun, : outcome.last.shape[1]] = outcome.last[begun]
         due = ~idle & (ended | (self._steps % self._every == 0))
         flags = outcome.terminated, outcome.truncated
@@ -210,7 +207,7 @@ class Rows:
         values: FloatArray,
         flags: tuple[MaskArray, MaskArray],
         infos: Infos,
-    ) -> Block:
+    ) -> TimeSeries:
         is_due = mask[self._indices]
         which = self._indices[is_due]
         env = self._episodes.prototype
@@ -218,12 +215,11 @@ class Rows:
         passed: Any = (env.inside.warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
             *([which] if self._episodes.is_vector else []),
-            *(self._number[which], self._steps[which]),
-            *(
-                spec.communication_point(passed, self._starts[which]),
-                *values[is_due].T,
-                *self._sums[which].T,
-            ),
+            self._number[which],
+            self._steps[which],
+            spec.communication_point(passed, self._starts[which]),
+            *values[is_due].T,
+            *self._sums[which].T,
             *(infos.numbers(*path)[which] for path in self._told),
             *(flag[which] for flag in flags),
         ]
@@ -232,7 +228,8 @@ class Rows:
             rows[index]: str(why) for index, why in infos.each("fault").items() if index in rows
         }
         table = np.array(parts, np.float64).T
-        return Block(table, told, _texts_in(table[:, self._texts]) if self._texts else {})
+        texts = _texts_in(table[:, self._texts]) if self._texts else {}
+        return replace(self.none, values=table, faults=told, texts=texts)
 
 
 def _texts_in(numbers: FloatArray) -> dict[float, str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
-from fmugym.series.store import FAULT, Block, cells_of, open_store
+from fmugym.series.store import FAULT, WHOLE, open_store
 from fmugym.signals import ordinary
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 
@@ -54,8 +54,18 @@ class TimeSeries:
         if name not in names:
             raise unknown_name("column", name, names)
         place = names.index(name)
-        column, values = self.columns[place], self.values[:, place]
-        return cells_of(values, column, self.texts) if column.kind in TEXT_KINDS else values
+        is_text = self.columns[place].kind in TEXT_KINDS
+        return self._cells(place) if is_text else self.values[:, place]
+
+    def cells(self) -> list[npt.NDArray[Any]]:
+        """The values of each column in their own type; a text that is missing is None."""
+        return list(map(self._cells, range(len(self.columns))))
+
+    def _cells(self, place: int) -> npt.NDArray[Any]:
+        kind, values = self.columns[place].kind, self.values[:, place]
+        if kind in TEXT_KINDS:
+            return np.array([self.texts.get(value) for value in values.tolist()], object)
+        return values.astype(np.int64) if kind in WHOLE else values
 
     def of_kind(self, *kinds: str) -> list[Quantity]:
         """The columns of some kinds."""
@@ -78,7 +88,19 @@ class TimeSeries:
     def _where(self, mask: Any) -> TimeSeries:
         rows = np.flatnonzero(mask).tolist()
         faults = {new: self.faults[old] for new, old in enumerate(rows) if old in self.faults}
-        return TimeSeries(self.columns, self.values[rows], faults, self.cost_limits, self.texts)
+        return replace(self, values=self.values[rows], faults=faults)
+
+    def joined(self, others: Iterable[TimeSeries]) -> TimeSeries:
+        """Put the rows of others, which have the same columns, behind these."""
+        parts, begin = [self, *others], 0
+        faults: dict[int, str] = {}
+        texts: dict[float, str] = {}
+        for part in parts:
+            texts |= part.texts
+            faults |= {begin + row: reason for row, reason in part.faults.items()}
+            begin += len(part)
+        values = np.concatenate([part.values for part in parts])
+        return replace(self, values=values, faults=faults, texts=texts)
 
     # Files.
 
@@ -93,7 +115,7 @@ class TimeSeries:
             FileExistsError: If the file exists.
         """
         store = open_store(check_path("the path of a recording", path), self.columns)
-        store.add(Block(self.values, self.faults, self.texts))
+        store.add(self)
         store.close()
 
     @classmethod
@@ -125,12 +147,9 @@ class TimeSeries:
         Raises:
             ConfigError: If pandas is missing.
         """
-        frame: Any = imported("pandas", "pandas").DataFrame(
-            {
-                column.name: cells_of(values, column, self.texts)
-                for column, values in zip(self.columns, self.values.T, strict=True)
-            }
-        )
+        names = [column.name for column in self.columns]
+        cells = dict(zip(names, self.cells(), strict=True))
+        frame: Any = imported("pandas", "pandas").DataFrame(cells)
         frame[FAULT] = [self.faults.get(row, "") for row in range(len(self))]
         frame.attrs["units"] = self.units
         return frame
