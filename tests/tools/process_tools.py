@@ -11,20 +11,11 @@ import building
 import fmu_tools
 import model_tools
 import pytest
+from zoo_tools import CALLS
 
 import fmugym
 
-FAULTS = {
-    "none": 0,
-    "crash": 1,
-    "abort": 2,
-    "exit": 3,
-    "hang": 4,
-    "close": 5,
-    "pause": 6,
-    "leak": 7,
-}
-STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
+FAULTS = ("none", "crash", "abort", "exit", "hang", "close", "pause", "leak")
 
 VARIABLES = (
     ("u", "input", 'start="0"'),
@@ -58,17 +49,13 @@ def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
     """Write the FMU; the token ``{faulty-F}`` lets it fail in its instantiation."""
     flags = 'canHandleVariableCommunicationStepSize="true" '
     flags += f"{model_tools.STATES[2]} {capabilities}"
-    xml = model_tools.describe(2, token, VARIABLES, flags, name="Faulty")
-    files = {
-        "modelDescription.xml": xml,
-        fmu_tools.library_name(2, "Faulty"): building.library("sources/faulty.c"),
-    }
-    return fmu_tools.write_fmu(Path(folder) / "Faulty.fmu", files)
+    path = Path(folder) / "Faulty.fmu"
+    return model_tools.model_fmu(path, "faulty", 2, token, VARIABLES, flags=flags, name="Faulty")
 
 
 def start_values(fault="none", stage="step", at=2):
-    """The parameters that ask for a fault."""
-    return {"fault": FAULTS[fault], "stage": STAGES[stage], "at": at}
+    """The parameters that ask for a fault in a call, of ``zoo_tools.CALLS``."""
+    return {"fault": FAULTS.index(fault), "stage": CALLS.index(stage), "at": at}
 
 
 class FaultyEnv(fmugym.FMI2CSEnv):

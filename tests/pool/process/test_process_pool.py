@@ -176,7 +176,7 @@ class TestSingle:
             assert env.step([1.0])[0] == [0.5]
 
     def test_a_process_that_ends_in_each_reset(self, make_env):
-        env = make_env("abort", "initialize")
+        env = make_env("abort", "exit")
         for _ in range(5):
             with pytest.raises(SimulationError, match="SIGABRT in a reset"):
                 env.reset()
