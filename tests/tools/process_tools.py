@@ -8,12 +8,9 @@ import time
 from pathlib import Path
 
 import building
-import fmu_tools
 import model_tools
 import pytest
-from zoo_tools import CALLS
-
-import fmugym
+from zoo_tools import CALLS, ZooEnv
 
 FAULTS = ("none", "crash", "abort", "exit", "hang", "close", "pause", "leak")
 
@@ -58,22 +55,12 @@ def start_values(fault="none", stage="step", at=2):
     return {"fault": FAULTS.index(fault), "stage": CALLS.index(stage), "at": at}
 
 
-class FaultyEnv(fmugym.FMI2CSEnv):
+class FaultyEnv(ZooEnv):
     """Integrates its action until the FMU does what its parameters say."""
 
     def __init__(self, path, fault="none", stage="step", at=2, **config):
-        config = {
-            "model_input_names": "u",
-            "model_output_names": "y",
-            "model_parameters": start_values(fault, stage, at),
-            "time_step": 0.5,
-            "bounds": {"u": (-1, 1)},
-            "isolation": "process",
-        } | config
-        super().__init__(path, fmu_tools.grouped(config))
-
-    def _is_done(self):
-        return self.state[0] < -1e9
+        own = {"model_parameters": start_values(fault, stage, at), "isolation": "process"}
+        super().__init__(path, **own | config)
 
 
 def _processes(is_meant):
