@@ -65,7 +65,6 @@ SLOW_MODULES = {
     "test_systems_isolated",
     "test_systems_linearization",
     "test_systems_many",
-    "test_systems_parts",
     "test_systems_resets",
     "test_systems_ssp",
     "test_systems_strings",

@@ -11,6 +11,7 @@ from combinations import in_turn
 from fmu_tools import edited_fmu
 from plants import PLANTS
 from pool_tools import open_pool, reset
+from system_tools import system
 from wine_tools import for_windows
 
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
@@ -18,7 +19,7 @@ from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, is_bundled
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.fmi import Status
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import Component, Group, SystemPlan
+from fmugym.systems.system_plan import Component
 
 OPTIONS = {
     "fmpy": {"backend": "fmpy"},
@@ -88,10 +89,9 @@ def make_pool(request, pools_of):
 def system_of(path):
     """A system of an FMU and a pendulum, whose variables can be looked up by the FMU's names."""
     components = Component("plant", path), Component("other", bundled_fmu("Pendulum"))
-    groups = tuple(Group((part.name,)) for part in components)
-    system = SystemFMU(SystemPlan("both", components, groups=groups))
-    system.variable = lambda name: system.description.variable(f"plant.{name}")
-    return system
+    both = SystemFMU(system(components, ()))
+    both.variable = lambda name: both.description.variable(f"plant.{name}")
+    return both
 
 
 def is_bundled_or_copy(path):

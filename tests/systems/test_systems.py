@@ -33,11 +33,9 @@ from fmugym.systems.system_plan import (
     Component,
     Connector,
     End,
-    Evaluation,
     Group,
     Link,
     Loop,
-    SystemPlan,
 )
 
 NO_START = ((), np.zeros((0, 1)))
@@ -99,14 +97,7 @@ def pendulums(master="gauss_seidel", versions=("2.0", "3.0", "2.0"), steps=(1, 2
         Link("b", "theta", "c", "tau", -0.03, 0.01),
         Link("c", "theta", "a", "tau", 0.01),
     )
-    return SystemPlan(
-        "chain",
-        components,
-        links,
-        tuple(Group((n,)) for n in names),
-        tuple(Evaluation((i,)) for i in range(3)),
-        master,
-    )
+    return system(components, links, master=master)
 
 
 PENDULUM_OUTPUTS = ["a.theta", "b.theta_dot", "c.q", "c.tau"]
@@ -294,15 +285,8 @@ class TestValues:
         probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
         parts = tuple(Component(n, p) for n, p in zip("ab", probes, strict=True))
         links = (Link("a", "steps", "b", "n"), Link("b", "on_out", "a", "free"))
-        plan = SystemPlan(
-            "types",
-            parts,
-            links,
-            (Group(("a",)), Group(("b",))),
-            (Evaluation((0,)), Evaluation((1,))),
-        )
         names = ["b.n_out", "a.free_out", "a.mode_out", "b.mode_out"]
-        pool = make(plan, ["b.on", "a.mode", "b.mode"], names)
+        pool = make(system(parts, links), ["b.on", "a.mode", "b.mode"], names)
         rows = play(pool, 2, np.array([[[1.0], [2.0], [5.0]]] * 2))
         assert rows[-1, 2:].tolist() == [2.0, 5.0]
         assert rows[-1, 1] == 1.0

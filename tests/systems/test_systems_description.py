@@ -151,8 +151,9 @@ class TestDrivenVariables:
 
 class TestComponents:
     def test_start_values_are_checked_against_the_fmu(self):
-        system = FMUSystem({"h": Component(HOUSE, {"A_f": 100, "solver": "rk4"})})
+        system = FMUSystem({"h": Component(HOUSE, {"A_f": 100, "solver": "rk4"}, steps=3)})
         assert system.plan.components[0].starts == (("A_f", 100.0), ("solver", 2.0))
+        assert system.plan.components[0].steps == 3
         for values, fact in (
             ({"A_ff": 1}, "A_f"),
             ({"T_air": 1}, "T_air"),

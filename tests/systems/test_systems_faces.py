@@ -12,7 +12,6 @@ from fmu_tools import PlainEnv
 import fmugym
 from fmugym import Component, ConfigError, FMUSystem, TaskError, bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters
-from fmugym.linearization import linearize
 from fmugym.systems.placing import picture_of
 from fmugym.testing import check_fmu_env
 
@@ -150,12 +149,6 @@ class TestEnvironments:
             fit_initial_states=False,
         )
         assert fit.values["east.A_f"] == pytest.approx(140.0, rel=1e-3)
-
-    def test_a_linear_model_has_the_names_of_the_system(self):
-        model = linearize(two_houses())
-        assert {"east.T_m", "west.T_m"} <= set(model.states)
-        assert {"outside", "east.u", "west.u"} <= set(model.inputs)
-        assert "east.T_out" not in model.inputs
 
     def test_what_drives_a_name_is_the_only_one(self):
         """An input behind a name of the system is set by that name alone."""

@@ -1,8 +1,5 @@
 """The FMU of ``exchange/clocks.c``, with clocks of all kinds."""
 
-from pathlib import Path
-
-import building
 import fmu_tools
 
 CLOCKS = {
@@ -57,18 +54,10 @@ def clocks_fmu(
     times as large.
     """
     clocks = CLOCKS if clocks is None else clocks
-    files = {
-        "modelDescription.xml": _describe(interface, event_mode, flags, clocks, arrays),
-        fmu_tools.library_name(3, "Clocks"): _library(clocks is not CLOCKS, scale),
-    }
-    return fmu_tools.write_fmu(Path(path), files)
-
-
-def _library(fractions, scale):
-    source = "exchange/clocks.c"
-    flags = ("-DFRACTIONS", f"-DSCALE={scale}") if fractions else ()
-    stubs = fmu_tools.stubs(3, "fmi3", building.HERE / source)
-    return building.library(source, flags=flags, stubs=stubs)
+    xml = _describe(interface, event_mode, flags, clocks, arrays)
+    options = () if clocks is CLOCKS else ("-DFRACTIONS", f"-DSCALE={scale}")
+    library = fmu_tools.model_library(3, "Clocks", "exchange/clocks.c", flags=options)
+    return fmu_tools.write_model(path, 3, "Clocks", xml, library)
 
 
 def _describe(interface, event_mode, flags, kinds, arrays):

@@ -1,8 +1,5 @@
 """FMUs for model exchange of the models in ``exchange``, each with its variables."""
 
-from pathlib import Path
-
-import building
 import fmu_tools
 
 STATES = {
@@ -76,22 +73,10 @@ def exchange_fmu(path, model, version=2, interfaces=("ModelExchange",), flags=""
         flags: More attributes of each.
         options: More arguments of the compiler.
     """
-    files = {
-        "modelDescription.xml": describe(model, version, interfaces, flags),
-        fmu_tools.library_name(version, "Model"): library(model, version, options),
-    }
-    return fmu_tools.write_fmu(Path(path), files)
-
-
-def library(model, version, options=()):
-    """The compiled library of a model for a version of FMI."""
-    shim = f"exchange/fmi{version}.c"
-    prefix = "Model_fmi" if version == 1 else f"fmi{version}"
-    stubs = fmu_tools.stubs(version, prefix, building.HERE / shim)
-    sources = [f"exchange/{name}.c" for name in ("core", "usual", model)]
-    return building.library(
-        *sources, shim, flags=(f"-DFMI_VERSION={version}", *options), stubs=stubs
-    )
+    sources = [f"exchange/{name}.c" for name in ("core", "usual", model, f"fmi{version}")]
+    library = fmu_tools.model_library(version, "Model", *sources, flags=options)
+    xml = describe(model, version, interfaces, flags)
+    return fmu_tools.write_model(path, version, "Model", xml, library)
 
 
 def describe(model, version, interfaces=("ModelExchange",), flags=""):

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 from fmpy import extract, read_model_description
-from fmpy.fmi2 import FMU2Slave
+from fmpy.simulation import apply_start_values, instantiate_fmu
 from gymnasium import spaces
 
 from fmugym.export import Activation, Layer, Network, Scaling, agent_of, write_c, write_onnx
@@ -240,24 +240,12 @@ class Runner:
 @contextmanager
 def plant_of(env, tmp_path):
     """The FMU of an environment in FMPy, with the parameters of its episode."""
-    path = env.fmu.path
-    description = read_model_description(str(path))
-    folder = extract(str(path), unzipdir=str(tmp_path / "plant"))
+    folder = extract(str(env.fmu.path), unzipdir=str(tmp_path / "plant"))
+    description = read_model_description(folder)
     variables = {v.name: v for v in description.modelVariables}
-    slave = FMU2Slave(
-        guid=description.guid,
-        unzipDirectory=folder,
-        modelIdentifier=description.coSimulation.modelIdentifier,
-        instanceName="plant",
-    )
-    slave.instantiate()
+    slave = instantiate_fmu(folder, description, "CoSimulation")
     slave.setupExperiment(startTime=0.0)
-    for name, value in env.parameters.items():
-        reference = [variables[name].valueReference]
-        if variables[name].type == "Enumeration":
-            slave.setInteger(reference, [int(value)])
-        else:
-            slave.setReal(reference, [value])
+    assert not apply_start_values(slave, description, dict(env.parameters))
     slave.enterInitializationMode()
     slave.exitInitializationMode()
 

@@ -153,16 +153,33 @@ def probe_library(version):
     return building.library("sources/probe.c", flags=(f"-DFMI_VERSION={version}",))
 
 
-def stubs(version, prefix, source):
+def stubs(version, prefix, source, made=()):
     """A line ``STUB(name)`` for each function of the standard that a C source does not have.
 
-    The functions are those that FMPy looks up, as its headers have them.
+    The functions are those that FMPy looks up, as its headers have them. Macros of the source may
+    have made some of them.
     """
     headers = (Path(fmpy.__file__).parent / "c-code").glob(f"fmi{version}*.h")
     text = "".join(path.read_text() for path in headers)
     names = set(re.findall(rf"\bfmi{version}(\w+?)TYPE\b", text))
     own = set(re.findall(rf"\b{prefix}(\w+)\(", source.read_text()))
-    return "".join(f"STUB({prefix}{name})\n" for name in sorted(names - own))
+    return "".join(f"STUB({prefix}{name})\n" for name in sorted(names - own - set(made)))
+
+
+def model_library(version, identifier, *sources, flags=(), made=()):
+    """The compiled library of a model; the last source has functions of the standard.
+
+    Args:
+        version: Of FMI.
+        identifier: Of the model.
+        sources: The C files, relative to ``tests``.
+        flags: More arguments of the compiler.
+        made: As in ``stubs``.
+    """
+    prefix = f"{identifier}_fmi" if version == 1 else f"fmi{version}"
+    flags = (f"-DFMI_VERSION={version}", *flags)
+    missing = stubs(version, prefix, building.HERE / sources[-1], made)
+    return building.library(*sources, flags=flags, stubs=missing)
 
 
 def platform_folder(version):
@@ -173,6 +190,12 @@ def platform_folder(version):
 def library_name(version, identifier="Probe"):
     """Where an FMU has its library for this machine."""
     return f"binaries/{platform_folder(version)}/{identifier}{fmpy.sharedLibraryExtension}"
+
+
+def write_model(path, version, identifier, description, library, add=None):
+    """Write an FMU of a model description, a library, and more files by name."""
+    files = {"modelDescription.xml": description, library_name(version, identifier): library}
+    return write_fmu(Path(path), files | (add or {}))
 
 
 def write_fmu(path, files, level=1):
@@ -198,11 +221,8 @@ def read_fmu(path):
 
 def probe_fmu(folder, version=2, edits=None, **keywords):
     """Make the probe FMU in a folder; ``edits`` and keywords as in ``edited_fmu``."""
-    files = {
-        "modelDescription.xml": probe_xml(version).encode(),
-        library_name(version): probe_library(version),
-    }
-    path = write_fmu(Path(folder) / "Probe.fmu", files)
+    path, xml = Path(folder) / "Probe.fmu", probe_xml(version)
+    write_model(path, version, "Probe", xml, probe_library(version))
     return edited_fmu(path, folder, edits, **keywords) if edits or keywords else path
 
 

@@ -5,7 +5,6 @@ import mmap
 import struct
 from pathlib import Path
 
-import building
 import fmu_tools
 import model_tools
 
@@ -17,8 +16,6 @@ CALLS = (
 
 WARNING, DISCARD, ERROR, FATAL, NOT_A_NUMBER, STOP = range(1, 7)
 _SIZE, _PLAN, _FIRST = 4096, 16, 16 + 8 * 16
-_PREFIXES = {1: "Lawful_fmi", 2: "fmi2", 3: "fmi3"}
-_SOURCE = "sources/lawful.c"
 
 
 class Record:
@@ -49,12 +46,6 @@ class Record:
         return self._map[_FIRST : _FIRST + 128].split(b"\0")[0].decode()
 
 
-def library(version):
-    """The compiled library."""
-    stubs = fmu_tools.stubs(version, _PREFIXES[version], building.HERE / _SOURCE)
-    return building.library(_SOURCE, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
-
-
 _VARIABLES = (
     ("u", "input", 'start="0"'),
     ("y", "output", ""),
@@ -66,13 +57,9 @@ _VARIABLES = (
 def lawful_fmu(folder, version):
     """Write the FMU, whose variables are all real: an input u, an output y, and parameters."""
     flags = f'canHandleVariableCommunicationStepSize="true" {model_tools.STATES[version]}'
-    files = {
-        "modelDescription.xml": model_tools.describe(
-            version, "{lawful}", _VARIABLES, flags, name="Lawful"
-        ),
-        fmu_tools.library_name(version, "Lawful"): library(version),
-    }
-    return fmu_tools.write_fmu(Path(folder) / "Lawful.fmu", files)
+    xml = model_tools.describe(version, "{lawful}", _VARIABLES, flags, name="Lawful")
+    library = fmu_tools.model_library(version, "Lawful", "sources/lawful.c")
+    return fmu_tools.write_model(Path(folder) / "Lawful.fmu", version, "Lawful", xml, library)
 
 
 class LawfulEnv(fmu_tools.PlainEnv):

@@ -1,8 +1,5 @@
 """FMUs of the models in ``zoo``, each with its variables, and an environment of two of them."""
 
-from pathlib import Path
-
-import building
 import fmu_tools
 
 import fmugym
@@ -31,20 +28,16 @@ def model_fmu(path, model, version, token, variables, definitions=(), add=None, 
         add: More files by name.
         description: As in ``describe``.
     """
-    files = {
-        "modelDescription.xml": describe(version, token, variables, **description),
-        fmu_tools.library_name(version, "Zoo"): library(version, model, *definitions),
-    }
-    return fmu_tools.write_fmu(Path(path), files | (add or {}))
+    xml = describe(version, token, variables, **description)
+    own = library(version, model, *definitions)
+    return fmu_tools.write_model(path, version, description.get("name", "Zoo"), xml, own, add)
 
 
 def library(version, model, *definitions):
     """The compiled library of a model for a version of FMI."""
-    shim = f"zoo/fmi{version}.c"
-    prefix = "Zoo_fmi" if version == 1 else f"fmi{version}"
-    stubs = fmu_tools.stubs(version, prefix, building.HERE / shim)
-    flags = tuple(f"-D{name}" for name in (f"FMI_VERSION={version}", *definitions))
-    return building.library(f"zoo/{model}.c", "zoo/usual.c", shim, flags=flags, stubs=stubs)
+    sources = (f"zoo/{name}.c" for name in (model, "usual", f"fmi{version}"))
+    flags = tuple(f"-D{name}" for name in definitions)
+    return fmu_tools.model_library(version, "Zoo", *sources, flags=flags)
 
 
 def describe(version, token, variables, flags=None, categories=(), name="Zoo"):

@@ -8,23 +8,11 @@ import time
 from pathlib import Path
 
 import building
-import fmu_tools
 import model_tools
 import pytest
+from zoo_tools import CALLS, ZooEnv
 
-import fmugym
-
-FAULTS = {
-    "none": 0,
-    "crash": 1,
-    "abort": 2,
-    "exit": 3,
-    "hang": 4,
-    "close": 5,
-    "pause": 6,
-    "leak": 7,
-}
-STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
+FAULTS = ("none", "crash", "abort", "exit", "hang", "close", "pause", "leak")
 
 VARIABLES = (
     ("u", "input", 'start="0"'),
@@ -58,35 +46,21 @@ def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
     """Write the FMU; the token ``{faulty-F}`` lets it fail in its instantiation."""
     flags = 'canHandleVariableCommunicationStepSize="true" '
     flags += f"{model_tools.STATES[2]} {capabilities}"
-    xml = model_tools.describe(2, token, VARIABLES, flags, name="Faulty")
-    files = {
-        "modelDescription.xml": xml,
-        fmu_tools.library_name(2, "Faulty"): building.library("sources/faulty.c"),
-    }
-    return fmu_tools.write_fmu(Path(folder) / "Faulty.fmu", files)
+    path = Path(folder) / "Faulty.fmu"
+    return model_tools.model_fmu(path, "faulty", 2, token, VARIABLES, flags=flags, name="Faulty")
 
 
 def start_values(fault="none", stage="step", at=2):
-    """The parameters that ask for a fault."""
-    return {"fault": FAULTS[fault], "stage": STAGES[stage], "at": at}
+    """The parameters that ask for a fault in a call, of ``zoo_tools.CALLS``."""
+    return {"fault": FAULTS.index(fault), "stage": CALLS.index(stage), "at": at}
 
 
-class FaultyEnv(fmugym.FMI2CSEnv):
+class FaultyEnv(ZooEnv):
     """Integrates its action until the FMU does what its parameters say."""
 
     def __init__(self, path, fault="none", stage="step", at=2, **config):
-        config = {
-            "model_input_names": "u",
-            "model_output_names": "y",
-            "model_parameters": start_values(fault, stage, at),
-            "time_step": 0.5,
-            "bounds": {"u": (-1, 1)},
-            "isolation": "process",
-        } | config
-        super().__init__(path, fmu_tools.grouped(config))
-
-    def _is_done(self):
-        return self.state[0] < -1e9
+        own = {"model_parameters": start_values(fault, stage, at), "isolation": "process"}
+        super().__init__(path, **own | config)
 
 
 def _processes(is_meant):

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import gymnasium
 import numpy as np
+from fmu_tools import PlainEnv
 from zoo_tools import ZooEnv, parameters, resident_bytes, zoo_fmu
 
 import fmugym
@@ -165,9 +166,11 @@ def rollouts(count):
 
 def cycles(count, **config):
     """Environments opened, used and closed, of each FMI version in turn."""
+    given = {"model_input_names": "f", "model_output_names": "x", "time_step": 0.02}
     for size in portions(count):
         for index in range(size):
-            env = Plain(FMI_VERSIONS[index % 3], **config)
+            path = fmugym.bundled_fmu("CartPole", FMI_VERSIONS[index % 3])
+            env = PlainEnv(path, given | config)
             env.reset()
             env.step(1.0)
             env.close()
@@ -193,17 +196,6 @@ def crashes(count):
             env.reset()  # samples are to be of a worker that is ready
             yield
         env.close()
-
-
-class Plain(fmugym.FMUEnv):
-    """The cart-pole of an FMI version without a task."""
-
-    def __init__(self, version, **config):
-        config |= {"model_input_names": "f", "model_output_names": "x", "time_step": 0.02}
-        super().__init__(fmugym.bundled_fmu("CartPole", version), config)
-
-    def _is_done(self):
-        return False
 
 
 def portions(count):

@@ -1,8 +1,5 @@
 """FMUs of the models in ``values``, with variables of all types and arrays, and environments."""
 
-from pathlib import Path
-
-import building
 import fmu_tools
 import model_tools
 import pytest
@@ -42,22 +39,9 @@ def state_space_fmu(
         fixed: Whether the sizes of its arrays are numbers instead of structural parameters.
         derivatives: The kind that it says to provide: ``"Directional"`` or ``"Adjoint"``.
     """
-    files = {
-        "modelDescription.xml": _describe_state_space(interfaces, fixed, derivatives),
-        fmu_tools.library_name(3, "Model"): _library("state_space", 3),
-    }
-    return fmu_tools.write_fmu(Path(path), files)
-
-
-def _library(model, version):
-    source = f"values/{model}.c"
-    prefix = "Model_fmi" if version == 1 else f"fmi{version}"
-    stubs = fmu_tools.stubs(version, prefix, building.HERE / source)
-    if model == "feedthrough":  # which has its functions for values by macros
-        made = [f"{prefix}{verb}{type_})" for verb in ("Get", "Set") for type_ in TYPES[version]]
-        made += [f"{prefix}{verb}String)" for verb in ("Get", "Set")]
-        stubs = "".join(f"{line}\n" for line in stubs.split() if not line.endswith(tuple(made)))
-    return building.library(source, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
+    xml = _describe_state_space(interfaces, fixed, derivatives)
+    library = fmu_tools.model_library(3, "Model", "values/state_space.c")
+    return fmu_tools.write_model(path, 3, "Model", xml, library)
 
 
 def _describe_state_space(interfaces, fixed, derivatives):
@@ -115,11 +99,9 @@ def feedthrough_fmu(path, version):
     2.0 have ``v[1]`` and ``v[2]``, which come out as ``w[1]`` and ``w[2]``; FMI 3.0 has a matrix
     ``v``, which comes out as ``w``.
     """
-    files = {
-        "modelDescription.xml": _describe_feedthrough(version),
-        fmu_tools.library_name(version, "Model"): _library("feedthrough", version),
-    }
-    return fmu_tools.write_fmu(Path(path), files)
+    made = [verb + type_ for verb in ("Get", "Set") for type_ in (*TYPES[version], "String")]
+    library = fmu_tools.model_library(version, "Model", "values/feedthrough.c", made=made)
+    return fmu_tools.write_model(path, version, "Model", _describe_feedthrough(version), library)
 
 
 _CAUSALITIES = ("input", "output", "parameter", "output")

@@ -8,6 +8,7 @@ from pathlib import Path
 import building
 import exchange_tools
 import fmu_tools
+import model_tools
 import pytest
 
 from fmugym import FMU
@@ -39,7 +40,12 @@ def for_windows(path, folder):
 
 
 def _library(model, version):
-    data = windows_library(f"sources/{model.lower()}.c", flags=(f"-DFMI_VERSION={version}",))
+    name, flags = model.lower(), (f"-DFMI_VERSION={version}",)
+    with building_for_windows():
+        if (building.HERE / f"zoo/{name}.c").exists():
+            data = model_tools.library(version, name)
+        else:
+            data = building.library(f"sources/{name}.c", flags=flags)
     return {f"binaries/{FOLDERS[version]}/{model}.dll": data}
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import sys
 
-import building
 import fmu_tools
 import model_tools
 import numpy as np
@@ -22,14 +21,11 @@ NUM_ENVS, NUM_STEPS = 128, 10_000
 
 def scratch_fmu(folder, kind):
     source = f"zoo/scratch_{kind}.{'cpp' if kind == 'objects' else 'c'}"
-    stubs = fmu_tools.stubs(2, "fmi2", building.HERE / "zoo/fmi2.c")
     sources = ("zoo/scratch.c", source, "zoo/usual.c", "zoo/fmi2.c")
-    flags = ("-DFMI_VERSION=2", "-Wl,--no-as-needed", "-lstdc++")
-    files = {
-        "modelDescription.xml": model_tools.describe(2, kind, model_tools.GAIN_VARIABLES),
-        fmu_tools.library_name(2, "Zoo"): building.library(*sources, flags=flags, stubs=stubs),
-    }
-    return fmu_tools.write_fmu(folder / kind / "Scratch.fmu", files)
+    flags = ("-Wl,--no-as-needed", "-lstdc++")
+    library = fmu_tools.model_library(2, "Zoo", *sources, flags=flags)
+    xml = model_tools.describe(2, kind, model_tools.GAIN_VARIABLES)
+    return fmu_tools.write_model(folder / kind / "Scratch.fmu", 2, "Zoo", xml, library)
 
 
 class ScratchEnv(model_tools.GainEnv):

@@ -12,7 +12,8 @@ import time
 import building
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv, edited_fmu, grouped, library_name, write_fmu
+from fmu_tools import PlainEnv, edited_fmu, grouped
+from model_tools import model_fmu
 from process_tools import linux_only, processes_with, wait_until
 
 import fmugym
@@ -27,12 +28,7 @@ from fmugym.trial.opening import make_pool
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="its faults are those of Unix")
 
-XML = """<fmiModelDescription fmiVersion="2.0" modelName="Mortal" guid="{token}">
-<CoSimulation modelIdentifier="Mortal"/>
-<ModelVariables>
-<ScalarVariable name="u" valueReference="0" causality="input"><Real start="0"/></ScalarVariable>
-<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
-</ModelVariables><ModelStructure/></fmiModelDescription>"""
+VARIABLES = (("u", "input", 'start="0"'), ("y", "output", ""))
 CONFIG = {
     "model_input_names": "u",
     "model_output_names": "y",
@@ -46,12 +42,9 @@ def make_fmu(tmp_path_factory):
     """Make an FMU that does as it is told."""
     folder = tmp_path_factory.mktemp("mortal")
 
-    def make(token="", **add):
-        files = {
-            "modelDescription.xml": XML.format(token=token),
-            library_name(2, "Mortal"): building.library("sources/mortal.c"),
-        }
-        return write_fmu(folder / token.replace(" ", "_") / "Mortal.fmu", files | add)
+    def make(token=""):
+        path = folder / token.replace(" ", "_") / "Mortal.fmu"
+        return model_fmu(path, "mortal", 2, token, VARIABLES, flags="", name="Mortal")
 
     return make
 

@@ -14,6 +14,7 @@ import tracemalloc
 import gymnasium as gym
 import numpy as np
 import pytest
+import test_vector_results
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
@@ -49,14 +50,8 @@ class Shaped(Drawing):
         return np.array([self.state[0], self.state[1]], np.float32)
 
 
-class Named(Shaped):
+class Named(Shaped, test_vector_results.Named):
     """A dict of arrays."""
-
-    def _get_observation_space(self):
-        return gym.spaces.Dict({"state": BOX, "steps": gym.spaces.Box(0, 99, (1,), np.int64)})
-
-    def _get_observation(self):
-        return {"state": self._array(), "steps": np.array([self.step_count])}
 
 
 class Square(Shaped):

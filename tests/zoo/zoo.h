@@ -1,6 +1,7 @@
 /* What fmi1.c, fmi2.c and fmi3.c, the interfaces of an FMU for FMI 1.0, 2.0 and 3.0, ask of a model.
 
-   The models: zoo.c does wrong what its parameters say; quirks.c is useful but breaks one promise;
+   The models: zoo.c and faulty.c do wrong what their parameters say, mortal.c what its token says;
+   quirks.c is useful but breaks one promise;
    demanding.c wants a licence or time; words.c says why it fails;
    resource.c reads a file; scratch.c works in data that instances share.
    usual.c does what a model leaves out, and what several do. */

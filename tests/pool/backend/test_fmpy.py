@@ -14,11 +14,9 @@ from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, grouped
 from plants import PLANTS
 
 import fmugym
-from fmugym import ConfigError, FMULoadError, bundled_fmu
+from fmugym import ConfigError, FMULoadError, FMUSystem, bundled_fmu
 from fmugym.archive.bundled import BUNDLED
 from fmugym.pool import PoolSpec
-from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import Component, Group, SystemPlan
 from fmugym.trial.opening import make_pool
 
 PENDULUM = bundled_fmu("Pendulum")
@@ -181,11 +179,9 @@ class TestRefusals:
             PlainEnv(path, config, backend="fmpy")
 
     def test_of_systems(self):
-        components = (Component("one", PENDULUM), Component("other", PENDULUM))
-        groups = tuple(Group((part.name,)) for part in components)
-        system = SystemFMU(SystemPlan("both", components, groups=groups))
+        both = FMUSystem({"one": PENDULUM, "other": PENDULUM}, []).as_fmu()
         with pytest.raises(ConfigError, match="a system"):
-            make_pool(system, PoolSpec((), (), 0.1), 1, logging.getLogger("test"), backend="fmpy")
+            make_pool(both, PoolSpec((), (), 0.1), 1, logging.getLogger("test"), backend="fmpy")
 
     def test_of_snapshots(self):
         env = gym.make("fmugym/Pendulum-v0", backend="fmpy").unwrapped

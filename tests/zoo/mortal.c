@@ -1,6 +1,9 @@
-/* An FMU of FMI 2.0 for tests of first meetings: what it does is in its token.
+/* FMUs for tests of first meetings: what they do is in their token.
 
    Reals: 0 "u" (input), 1 "y" (output). Lines go to standard output and to the FMI logger. */
+
+#define _GNU_SOURCE
+#include "zoo.h"
 
 #include <signal.h>
 #include <stdio.h>
@@ -9,23 +12,15 @@
 #include <time.h>
 #include <unistd.h>
 
-#include "fmi2_stubs.h"
-
-typedef void (*Logger)(void *, const char *, int, const char *, const char *, ...);
-
-typedef struct {
-    Logger logger;
-} Callbacks;
-
 enum { NUMBERS = 512, HARMLESS_STEPS = 15, HARMLESS_RESETS = 2 };
 
-typedef struct {
+struct Animal {
     double values[2];
     char token[32];
     double *numbers; /* a block of memory of its own */
     double *beside;  /* most likely the next block, so that what is beyond the first one is ours */
     int steps, resets;
-} Mortal;
+};
 
 static int instances;
 static void *shared; /* memory of the first instance, which each one frees */
@@ -49,16 +44,16 @@ static void do_as_told(const char *token, const char *call) {
     }
 }
 
-void *fmi2Instantiate(const char *name, int type, const char *token, const char *resources,
-                      const Callbacks *callbacks, int visible, int logging) {
+Animal *zoo_instantiate(const Birth *birth) {
+    const char *token = birth->token;
     instances++;
     if (strcmp(token, "licence") == 0) {
-        callbacks->logger(NULL, name, 3, "licence", "no licence for %d seats", 5);
+        birth->logger(NULL, birth->name, ERROR, "licence", "no licence for %d seats", 5);
         printf("so much for the licence\n"); /* not flushed */
         abort();
     }
     if (strcmp(token, "refuse") == 0) {
-        callbacks->logger(NULL, name, 3, "licence", "all %d seats are taken", 5);
+        birth->logger(NULL, birth->name, ERROR, "licence", "all %d seats are taken", 5);
         return NULL;
     }
     if (strcmp(token, "exit") == 0) {
@@ -80,7 +75,7 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
         abort();
     }
     do_as_told(token, "instantiate");
-    Mortal *me = calloc(1, sizeof *me);
+    Animal *me = calloc(1, sizeof *me);
     snprintf(me->token, sizeof me->token, "%s", token);
     me->numbers = calloc(NUMBERS, sizeof *me->numbers);
     me->beside = calloc(NUMBERS, sizeof *me->beside);
@@ -88,7 +83,7 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
     return me;
 }
 
-void fmi2FreeInstance(Mortal *me) {
+void zoo_free(Animal *me) {
     do_as_told(me->token, "free");
     if (strcmp(me->token, "free what is shared") == 0) {
         free(shared);
@@ -98,21 +93,16 @@ void fmi2FreeInstance(Mortal *me) {
     free(me);
 }
 
-int fmi2SetupExperiment(Mortal *me, int tolerance_defined, double tolerance, double start,
-                        int stop_defined, double stop) {
-    return 0;
+int zoo_call(Animal *me, enum call call) {
+    return call == ENTER && strcmp(me->token, "needy") == 0 ? ERROR : OK;
 }
 
-int fmi2EnterInitializationMode(Mortal *me) {
-    return strcmp(me->token, "needy") == 0 ? 3 : 0;
-}
-
-int fmi2ExitInitializationMode(Mortal *me) {
+int zoo_exit(Animal *me) {
     do_as_told(me->token, "initialization");
-    return 0;
+    return OK;
 }
 
-int fmi2DoStep(Mortal *me, double time, double step_size, int no_set_state) {
+int zoo_step(Animal *me, double step_size, bool no_set_state) {
     do_as_told(me->token, "step");
     me->values[1] = me->values[0];
     me->steps++;
@@ -122,35 +112,23 @@ int fmi2DoStep(Mortal *me, double time, double step_size, int no_set_state) {
     if (strcmp(me->token, "overrun later") == 0 && me->steps > HARMLESS_STEPS) {
         memset(me->numbers + NUMBERS, 1, 64);
     }
-    return 0;
+    return OK;
 }
 
-int fmi2GetReal(Mortal *me, const unsigned *vr, size_t count, double *values) {
-    for (size_t i = 0; i < count; i++) {
-        values[i] = me->values[vr[i]];
-    }
-    return 0;
+int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
+    zoo_read(me->values, references, count, values);
+    return OK;
 }
 
-int fmi2SetReal(Mortal *me, const unsigned *vr, size_t count, const double *values) {
-    for (size_t i = 0; i < count; i++) {
-        me->values[vr[i]] = values[i];
-    }
-    return 0;
+int zoo_set(Animal *me, const unsigned *references, size_t count, const double *values) {
+    zoo_write(me->values, references, count, values);
+    return OK;
 }
 
-int fmi2Terminate(Mortal *me) {
-    return 0;
-}
-
-int fmi2Reset(Mortal *me) {
+int zoo_reset(Animal *me) {
     if (++me->resets > HARMLESS_RESETS) {
         do_as_told(me->token, "a later reset");
     }
     me->values[0] = me->values[1] = 0.0;
-    return 0;
+    return OK;
 }
-
-STUB(GetFMUstate)
-STUB(SetFMUstate)
-STUB(FreeFMUstate)
