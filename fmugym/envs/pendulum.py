@@ -167,9 +167,12 @@ def _squared(value: Any) -> Any:
     """Square by the C library's ``pow``, as Gymnasium does; a product differs in a bit at times.
 
     ``**`` multiplies arrays. Of float64, ``numpy.float_power`` comes nearest, as ``numpy.power``
-    has loops of its own on some processors; of float32, it would round in another way.
+    has loops of its own on some processors, which are slow where a number is negative; of float32,
+    ``numpy.float_power`` would round in another way.
     """
-    if isinstance(value, np.ndarray):
-        power = np.power if value.dtype == np.float32 else np.float_power
-        return power(value, np.full_like(value, 2.0))
-    return value**2
+    if not isinstance(value, np.ndarray):
+        return value**2
+    two = np.full_like(value, 2.0)
+    if value.dtype == np.float32:
+        return np.power(np.abs(value), two)
+    return np.float_power(value, two)
