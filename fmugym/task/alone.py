@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from threading import RLock
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
@@ -24,14 +24,13 @@ class Guard(Protocol):
     ``with guard:`` waits for another thread.
     """
 
-    def run(self, name: str, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+    def run(self, name: str, function: Callable[..., R], /, *args: Any) -> R:
         """Call a function.
 
         Args:
             name: The method of the environment that does so.
             function: The function.
             args: Its arguments.
-            kwargs: Its arguments by name.
 
         Raises:
             SimulationError: If another thread is in a method of this environment.
@@ -48,14 +47,14 @@ class _PythonGuard:
     def __init__(self) -> None:
         self._lock = RLock()
 
-    def run(self, name: str, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+    def run(self, name: str, function: Callable[..., R], /, *args: Any) -> R:
         if not self._lock.acquire(blocking=False):
             raise SimulationError(
                 f"{name} is not possible while another thread is in a method of this environment, "
                 "which is for one thread at a time"
             )
         try:
-            return function(*args, **kwargs)
+            return function(*args)
         finally:
             self._lock.release()
 
@@ -82,6 +81,6 @@ def alone(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P],
     @wraps(method)
     def guarded(self: S, /, *args: P.args, **kwargs: P.kwargs) -> R:
         guard: Guard = self.inside.guard
-        return guard.run(name, method, self, *args, **kwargs)
+        return guard.run(name, partial(method, self, *args, **kwargs))
 
     return guarded

@@ -314,12 +314,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _step(self, actions: Any, in_background: bool = False) -> StepResult:
         inside = self.inside
         engine = inside.engine
+        any_ended = engine.any_ended
         is_busy = self._background.is_pending and not in_background
-        has_to_wait = engine.any_ended and self._waits
-        if not inside.episodes.is_ready or self.closed or is_busy or has_to_wait:
+        if not inside.episodes.is_ready or self.closed or is_busy or (any_ended and self._waits):
             self._require_ready("step")
         try:
-            result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
+            result = engine.step(actions, engine.ended.copy() if any_ended else None)
             if engine.any_ended and self.autoreset_mode is _SAME_STEP:
                 for look in inside.at_ends:
                     look(actions)

@@ -39,10 +39,8 @@ void guard_give_back(PyObject *guard) {
     ((PyGuard *)guard)->depth--;
 }
 
-static PyObject *guard_run(PyObject *object, PyObject *args, PyObject *kwargs) {
-    const Py_ssize_t count = PyTuple_Size(args);
-    const char *name =
-        count < 2 ? NULL : PyUnicode_AsUTF8AndSize(PyTuple_GetItem(args, 0), NULL);
+static PyObject *guard_run(PyObject *object, PyObject *const *args, Py_ssize_t count) {
+    const char *name = count < 2 ? NULL : PyUnicode_AsUTF8AndSize(args[0], NULL);
 
     if (name == NULL) {
         if (!PyErr_Occurred()) {
@@ -50,9 +48,12 @@ static PyObject *guard_run(PyObject *object, PyObject *args, PyObject *kwargs) {
         }
         return NULL;
     }
-    PyObject *rest = PyTuple_GetSlice(args, 2, count), *result = NULL;
+    PyObject *rest = PyTuple_New(count - 2), *result = NULL;
+    for (Py_ssize_t i = 2; rest != NULL && i < count; i++) {
+        PyTuple_SetItem(rest, i - 2, Py_NewRef(args[i]));
+    }
     if (rest != NULL && guard_take(object, name)) {
-        result = PyObject_Call(PyTuple_GetItem(args, 1), rest, kwargs);
+        result = PyObject_Call(args[1], rest, NULL);
         guard_give_back(object);
     }
     Py_XDECREF(rest);
@@ -87,7 +88,7 @@ static void guard_dealloc(PyObject *object) {
 }
 
 static PyMethodDef methods[] = {
-    {"run", (PyCFunction)(void (*)(void))guard_run, METH_VARARGS | METH_KEYWORDS, NULL},
+    {"run", (PyCFunction)(void (*)(void))guard_run, METH_FASTCALL, NULL},
     {"__enter__", guard_enter, METH_NOARGS, NULL},
     {"__exit__", guard_exit, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},

@@ -458,11 +458,10 @@ class BatchEngine(Engine):
             actions = self._checked_before(actions, resetting)
         at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
-        step = step if self.offsets is None else None
         self.has_moved = True  # unless the call refuses its arguments
         played: Played
         try:
-            if step is None or in_python:
+            if step is None or in_python or self.offsets is not None:
                 played = self._step_pool(actions, resetting)
             else:
                 played = step(actions, at_ends)
