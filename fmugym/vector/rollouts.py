@@ -359,9 +359,10 @@ def roll_out_by_steps(
     over = np.zeros(len(engine.ended), np.bool_)
     results: list[StepResult] = []
     for step in range(horizon):
-        result = engine.step(act(step, observations), None, over.copy() if over.any() else None)
-        if over.any():
-            result = _without(result, observations, over)
+        resting = over.copy() if np.count_nonzero(over) else None
+        result = engine.step(act(step, observations), None, resting)
+        if resting is not None:
+            result = _without(result, observations, resting)
         over |= result.terminated | result.truncated
         observations = result.observations
         results.append(result)
