@@ -163,14 +163,9 @@ class Declarations:
             low, high = self.limits_of(self.deviations[name].setpoint)
             least, most = self.limits_of(self.deviations[name].of)
             return low - most, high - least
-        if name in self.series:
-            return self.series[name].low, self.series[name].high
-        if name in self.steps:
-            return self.steps[name].limits
-        if name in self.memory:
-            return self.memory[name].limits
-        if name in self.derived:
-            return self.derived[name].limits
+        for section in (self.series, self.steps, self.memory, self.derived):
+            if name in section:
+                return section[name].limits
         variable = self.variables[name]
         return variable.low, variable.high
 
