@@ -284,21 +284,11 @@ class TaskVariables:
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
     """The limits of the task, or else those of the FMU."""
-    given, (low, high) = entry.value or {}, _own_limits(variable, conversion)
+    own = (-math.inf, math.inf) if variable is None else variable.extremes
+    given, (low, high) = entry.value or {}, sorted(map(conversion, own))
     low, high = given.get("min", low), given.get("max", high)
     if not low < high and given.keys() & {"min", "max"}:
         raise entry.error(f"min must be below max, got {low:g} and {high:g}")
-    return low, high
-
-
-def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
-    if variable is None:
-        return -math.inf, math.inf
-    if variable.kind == "boolean":
-        return 0.0, 1.0
-    values: list[float] = [value for _, value in variable.items]
-    limits = (min(values), max(values)) if values else (variable.minimum, variable.maximum)
-    low, high = sorted(map(conversion, limits))
     return low, high
 
 
