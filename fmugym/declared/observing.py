@@ -298,7 +298,7 @@ def _with_error(
         channel: The number of the forecast.
     """
     size: float = part ** _GROWTHS[errors["growth"]]
-    error = errors["std"] * size * noise_in(count, channel)
+    error: Value = errors["std"] * size * noise_in(count, channel)
     if errors["bias"]:
         lasting = noise_in(first_step(value.graph), channel + _CHANNELS_OF_BIASES)
         error = error + errors["bias"] * size * lasting
