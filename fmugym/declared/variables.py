@@ -103,11 +103,6 @@ class TaskVariable:
             )
         return self.in_fmu
 
-    @property
-    def is_bounded(self) -> bool:
-        """Whether both limits are finite."""
-        return math.isfinite(self.low) and math.isfinite(self.high)
-
 
 class TaskVariables:
     """The variables by their aliases; a variable of the FMU needs no declaration to be used.
@@ -310,7 +305,12 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
     Raises:
         ConfigError: If the variable cannot be set, or the value does not fit it.
     """
-    in_fmu = _settable(variable, entry)
+    in_fmu = variable.fmu_variable
+    if not in_fmu.settable_at_start:
+        raise entry.error(
+            f"{in_fmu.name!r} cannot be set at the start of an episode: it is a "
+            f"{in_fmu.variability} {in_fmu.causality}"
+        )
     if in_fmu.shape:
         return _array_start(in_fmu, entry)
     value, is_text = entry.value, bool(in_fmu.items) or in_fmu.kind == "string"
@@ -321,27 +321,6 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
         if in_fmu.kind == "string":
             return value
         return within(in_fmu, checked(in_fmu, value))
-
-
-def fitted_value(variable: TaskVariable, entry: Entry, value: Any) -> Any:
-    """A distribution of a parameter that is in the unit of the FMU already.
-
-    Raises:
-        ConfigError: As ``start_value``.
-    """
-    in_fmu = _settable(variable, entry)
-    with entry.placing():
-        return within(in_fmu, checked(in_fmu, value))
-
-
-def _settable(variable: TaskVariable, entry: Entry) -> Variable:
-    in_fmu = variable.fmu_variable
-    if not in_fmu.settable_at_start:
-        raise entry.error(
-            f"{in_fmu.name!r} cannot be set at the start of an episode: it is a "
-            f"{in_fmu.variability} {in_fmu.causality}"
-        )
-    return in_fmu
 
 
 def _array_start(variable: Variable, entry: Entry) -> Any:
