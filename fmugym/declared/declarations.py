@@ -168,8 +168,7 @@ class Declarations:
         for section in (self.series, self.steps, self.memory, self.derived):
             if name in section:
                 return section[name].limits
-        variable = self.variables[name]
-        return variable.low, variable.high
+        return self.variables[name].limits
 
     def agent(self, key: str) -> Entry:
         """The entry of a key of the agent.

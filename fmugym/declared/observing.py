@@ -15,6 +15,7 @@ from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
+from fmugym.declared.parts import Limits
 from fmugym.declared.quantities import nearest_steps, steps_in
 from fmugym.declared.variables import TaskVariable
 
@@ -67,15 +68,14 @@ class Seen(NamedTuple):
         entry: Where it is declared.
         name: What it is the value of.
         value: Its value.
-        low, high: Its limits.
+        limits: Its limits.
         place: Which value of a forecast or history it is, such as ``"[+3600 s]"``.
     """
 
     entry: Entry
     name: str
     value: Value
-    low: float
-    high: float
+    limits: Limits
     place: str = ""
 
 
@@ -259,7 +259,7 @@ def _present(naming: Naming, past: _Past) -> Iterator[Seen]:
     declared = naming.declared
     for entry, name in declared.observed:
         with entry.noting():
-            yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
+            yield Seen(entry, name, past.measured(entry, name, 0), declared.limits_of(name))
 
 
 def _forecasts(naming: Naming) -> Iterator[Seen]:
@@ -279,7 +279,7 @@ def _forecasts(naming: Naming) -> Iterator[Seen]:
                         later = naming.step_count + nearest_steps(ahead, time_step)
                         value = _with_error(value, errors, index / count, later, channel)
                     limits = declared.limits_of(one.value)
-                    yield Seen(one, one.value, value, *limits, f"[+{ahead:g} s]")
+                    yield Seen(one, one.value, value, limits, f"[+{ahead:g} s]")
 
 
 def _with_error(
@@ -327,7 +327,7 @@ def _remembered(naming: Naming, past: _Past) -> Iterator[Seen]:
         limits = declared.limits_of(name)
         for ago in range(1, 1 + _kept_steps(naming)):
             value = past.measured(entry, name, ago)
-            yield Seen(entry, name, value, *limits, f"[-{ago * naming.time_step:g} s]")
+            yield Seen(entry, name, value, limits, f"[-{ago * naming.time_step:g} s]")
 
 
 def normalized(seen: Seen, nominal: float | None) -> Seen:
@@ -340,8 +340,8 @@ def normalized(seen: Seen, nominal: float | None) -> Seen:
         raise seen.entry.error(
             f"{seen.name!r} has no nominal value: give it 'nominal', or 'min' and 'max'"
         )
-    low, high = seen.low / nominal, seen.high / nominal
-    return seen._replace(value=seen.value / nominal, low=low, high=high)
+    low, high = seen.limits
+    return seen._replace(value=seen.value / nominal, limits=(low / nominal, high / nominal))
 
 
 def scaled(seen: Seen) -> Seen:
@@ -350,12 +350,13 @@ def scaled(seen: Seen) -> Seen:
     Raises:
         ConfigError: If a limit is infinite.
     """
-    if not np.isfinite([seen.low, seen.high]).all():
+    if not np.isfinite(seen.limits).all():
         raise seen.entry.error(
             f"{seen.name!r} needs 'min' and 'max' so that observations can be normalized"
         )
-    middle, half = (seen.low + seen.high) / 2, (seen.high - seen.low) / 2
-    return seen._replace(value=(seen.value - middle) / half, low=-1.0, high=1.0)
+    low, high = seen.limits
+    middle, half = (low + high) / 2, (high - low) / 2
+    return seen._replace(value=(seen.value - middle) / half, limits=(-1.0, 1.0))
 
 
 def remember(kept: list[History], first_step: int) -> Callable[[Any], None]:

@@ -336,7 +336,7 @@ class ResolvedTask:
             and all(is_plain(variables[name]) for name in names)
         ):
             return None
-        return _box([(seen.low, seen.high) for seen in self._normalized])
+        return _box([seen.limits for seen in self._normalized])
 
     @cached_property
     def _normalized(self) -> list[Seen]:
