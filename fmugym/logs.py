@@ -340,7 +340,7 @@ def _as_logged(entry: Entry, log: PlantLog, name: str) -> dict[str, Any]:
     left_out = "file", "column", "table", "time", "step"
     kept = {key: value for key, value in entry.value.items() if key not in left_out}
     found = {"values": values.tolist(), "times": times.tolist(), "period": _YEAR}
-    return {"min": series.low, "max": series.high, **kept, **found}
+    return dict(zip(("min", "max"), series.limits, strict=True)) | kept | found
 
 
 def declared_as(env: FMUEnv, alias: str) -> tuple[str, str | None]:

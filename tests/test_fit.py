@@ -255,6 +255,12 @@ class TestFitted:
         assert info["l"].tolist() == [one["l"] for one in single]
         assert info["c"].tolist() == [one["c"] for one in single]
 
+    def test_rows_are_in_the_units_of_the_fmu(self, document):
+        document["variables"] = document.get("variables", {}) | {"cm": {"name": "l", "unit": "cm"}}
+        document["parameters"] = {"cm": 10}
+        with fmugym.load(document) as env:
+            assert 0.05 <= drawn(env, 0)["l"] <= 0.2
+
     def test_python_draws_the_same_where_c_cannot(self, document):
         """A distribution of the user's between them is drawn by Python."""
 

@@ -211,6 +211,14 @@ class Variable:
         return (self.minimum, self.maximum) if self.bounds is None else self.bounds
 
     @property
+    def extremes(self) -> tuple[float, float]:
+        """The lowest and the highest value: of a Boolean, of the items, or else of the range."""
+        if self.kind == "boolean":
+            return 0.0, 1.0
+        values = [value for _, value in self.items]
+        return (min(values), max(values)) if values else self.range
+
+    @property
     def limits(self) -> tuple[float, float]:
         """Minimum and maximum that mean something; infinite where they do not.
 

@@ -37,9 +37,9 @@ _MOST_NODES: Final = 50_000
 _DOUBLE: Final = np.dtype(np.float64)
 
 
-def _operator(ufunc: np.ufunc, is_reflected: bool = False) -> Callable[[Value, Any], Value]:
+def _operator(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
     def apply(own: Value, other: Any) -> Value:
-        value: Value = ufunc(other, own) if is_reflected else ufunc(own, other)
+        value: Value = ufunc(own, other)
         return value
 
     return apply
@@ -152,9 +152,9 @@ class Value:
             raise ConfigError(f"the task has too many terms: it computes more than {_MOST_NODES}")
         return Value(self.graph, cell)
 
-    __add__, __radd__ = _operator(np.add), _operator(np.add, True)
+    __add__ = __radd__ = _operator(np.add)
     __sub__, __mod__ = _operator(np.subtract), _operator(np.remainder)
-    __mul__, __rmul__ = _operator(np.multiply), _operator(np.multiply, True)
+    __mul__ = __rmul__ = _operator(np.multiply)
     __truediv__ = _operator(np.divide)
     __lt__, __gt__ = _operator(np.less), _operator(np.greater)
     # Comparisons make nodes instead of bools, and so there is no hash.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import keyword
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from itertools import product
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
+from fmugym.archive.units import IDENTITY
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.fitted import read_fitted
@@ -25,7 +27,7 @@ from fmugym.declared.parts import (
 )
 from fmugym.declared.series import read_data
 from fmugym.declared.setpoints import SetPoints
-from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, fitted_value, start_value
+from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, start_value
 from fmugym.declared.warming import read_warm_up
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
@@ -163,16 +165,10 @@ class Declarations:
             low, high = self.limits_of(self.deviations[name].setpoint)
             least, most = self.limits_of(self.deviations[name].of)
             return low - most, high - least
-        if name in self.series:
-            return self.series[name].low, self.series[name].high
-        if name in self.steps:
-            return self.steps[name].limits
-        if name in self.memory:
-            return self.memory[name].limits
-        if name in self.derived:
-            return self.derived[name].limits
-        variable = self.variables[name]
-        return variable.low, variable.high
+        for section in (self.series, self.steps, self.memory, self.derived):
+            if name in section:
+                return section[name].limits
+        return self.variables[name].limits
 
     def agent(self, key: str) -> Entry:
         """The entry of a key of the agent.
@@ -276,7 +272,9 @@ class Declarations:
         with entry.noting():
             for name, column in read_fitted(entry).items():
                 variable = self.variables.find(entry, aliases.get(name, name), "variable")
-                fitted[variable.alias] = variable, fitted_value(variable, entry, column)
+                in_its_unit = replace(variable, conversion=IDENTITY)
+                value = start_value(in_its_unit, replace(entry, value=column))
+                fitted[variable.alias] = variable, value
         return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
     def _parameter(self, entry: Entry) -> tuple[TaskVariable, Any]:
@@ -338,7 +336,7 @@ def _check_action(variable: TaskVariable) -> None:
             f"{variable.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
             f"{', '.join(map(repr, DEVICE))} are for inputs"
         )
-    if not variable.levels and not variable.is_bounded:
+    if not np.isfinite(variable.range).all():
         raise variable.entry.lack(
             f"the action {variable.alias!r} needs limits, which the FMU does not give: "
             "give it 'min' and 'max', or 'levels'",

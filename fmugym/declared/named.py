@@ -50,7 +50,7 @@ def _quantities(naming: Naming) -> Iterator[Quantity]:
 
 def _of_variable(declared: Declarations, alias: str, kind: str) -> Quantity:
     variable = declared.variables[alias]
-    return Quantity(alias, kind, _shown(variable.unit), variable.low, variable.high)
+    return Quantity(alias, kind, _shown(variable.unit), *variable.limits)
 
 
 def _shown(unit: str | None) -> str:

@@ -398,7 +398,7 @@ class Naming:
         value = now + chosen
         if self.declared.is_physical:
             value = clip(chosen, now - variable.delta, now + variable.delta)
-        limited: Value = clip(value, variable.low, variable.high)
+        limited: Value = clip(value, *variable.limits)
         return limited
 
     def _place_of(self, variable: TaskVariable) -> int:

@@ -15,6 +15,7 @@ from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
+from fmugym.declared.parts import Limits
 from fmugym.declared.quantities import nearest_steps, steps_in
 from fmugym.declared.variables import TaskVariable
 
@@ -67,15 +68,14 @@ class Seen(NamedTuple):
         entry: Where it is declared.
         name: What it is the value of.
         value: Its value.
-        low, high: Its limits.
+        limits: Its limits.
         place: Which value of a forecast or history it is, such as ``"[+3600 s]"``.
     """
 
     entry: Entry
     name: str
     value: Value
-    low: float
-    high: float
+    limits: Limits
     place: str = ""
 
 
@@ -259,7 +259,7 @@ def _present(naming: Naming, past: _Past) -> Iterator[Seen]:
     declared = naming.declared
     for entry, name in declared.observed:
         with entry.noting():
-            yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
+            yield Seen(entry, name, past.measured(entry, name, 0), declared.limits_of(name))
 
 
 def _forecasts(naming: Naming) -> Iterator[Seen]:
@@ -269,65 +269,50 @@ def _forecasts(naming: Naming) -> Iterator[Seen]:
         with entry.child("horizon").noting():
             horizon = entry.required("horizon")
             count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
-        error = _error_of(entry.child("error").value)
+        errors = entry.child("error").value if _errs(entry) else None
         for channel, one in enumerate(entry.child("of").elements(), _CHANNELS_OF_FORECASTS):
             with one.noting():
                 for index in range(1, count + 1):
                     ahead = index * step
                     value = naming.forecast(one, one.value, ahead)
-                    if error is not None:
+                    if errors is not None:
                         later = naming.step_count + nearest_steps(ahead, time_step)
-                        value = error.added(value, index / count, later, channel)
+                        value = _with_error(value, errors, index / count, later, channel)
                     limits = declared.limits_of(one.value)
-                    yield Seen(one, one.value, value, *limits, f"[+{ahead:g} s]")
+                    yield Seen(one, one.value, value, limits, f"[+{ahead:g} s]")
 
 
-class ForecastError(NamedTuple):
-    """How forecasts err.
+def _with_error(
+    value: Value, errors: Mapping[str, Any], part: float, count: Value, channel: int
+) -> Value:
+    """A forecast with errors.
 
-    Attributes:
-        std: The standard deviation of the error at the horizon.
-        bias: That of an error which stays the same in an episode.
-        growth: The exponent with which errors grow with the time ahead.
-        relative: Whether errors are parts of the value.
+    The errors belong to the time that the forecast is made for: forecasts of one time err in the
+    same direction, and less and less as the time comes near.
+
+    Args:
+        value: The true value.
+        errors: How forecasts err, by the keys of the format.
+        part: The time ahead as a part of the horizon.
+        count: The number of the step that the forecast is made for.
+        channel: The number of the forecast.
     """
-
-    std: float
-    bias: float = 0.0
-    growth: float = 0.5
-    relative: bool = False
-
-    def added(self, value: Value, part: float, count: Value, channel: int) -> Value:
-        """A forecast with errors.
-
-        The errors belong to the time that the forecast is made for: forecasts of one time err in
-        the same direction, and less and less as the time comes near.
-
-        Args:
-            value: The true value.
-            part: The time ahead as a part of the horizon.
-            count: The number of the step that the forecast is made for.
-            channel: The number of the forecast.
-        """
-        size: float = part**self.growth
-        error = self.std * size * noise_in(count, channel)
-        if self.bias:
-            channel += _CHANNELS_OF_BIASES
-            error = error + self.bias * size * noise_in(first_step(value.graph), channel)
-        return value + value * error if self.relative else value + error
+    size: float = part ** _GROWTHS[errors["growth"]]
+    error: Value = errors["std"] * size * noise_in(count, channel)
+    if errors["bias"]:
+        lasting = noise_in(first_step(value.graph), channel + _CHANNELS_OF_BIASES)
+        error = error + errors["bias"] * size * lasting
+    return value + value * error if errors["relative"] else value + error
 
 
-def _error_of(given: Mapping[str, Any] | None) -> ForecastError | None:
-    """How a forecast errs; None if it does not."""
-    if given is None or not (given["std"] or given["bias"]):
-        return None
-    growth = _GROWTHS[given["growth"]]
-    return ForecastError(given["std"], given["bias"], growth, given["relative"])
+def _errs(forecast: Entry) -> bool:
+    errors = forecast.child("error").value
+    return errors is not None and bool(errors["std"] or errors["bias"])
 
 
 def has_errors(declared: Declarations) -> bool:
     """Whether a forecast has errors."""
-    return any(_error_of(entry.child("error").value) for entry in _forecasts_in(declared))
+    return any(map(_errs, _forecasts_in(declared)))
 
 
 def _forecasts_in(declared: Declarations) -> list[Entry]:
@@ -342,7 +327,7 @@ def _remembered(naming: Naming, past: _Past) -> Iterator[Seen]:
         limits = declared.limits_of(name)
         for ago in range(1, 1 + _kept_steps(naming)):
             value = past.measured(entry, name, ago)
-            yield Seen(entry, name, value, *limits, f"[-{ago * naming.time_step:g} s]")
+            yield Seen(entry, name, value, limits, f"[-{ago * naming.time_step:g} s]")
 
 
 def normalized(seen: Seen, nominal: float | None) -> Seen:
@@ -355,8 +340,8 @@ def normalized(seen: Seen, nominal: float | None) -> Seen:
         raise seen.entry.error(
             f"{seen.name!r} has no nominal value: give it 'nominal', or 'min' and 'max'"
         )
-    low, high = seen.low / nominal, seen.high / nominal
-    return seen._replace(value=seen.value / nominal, low=low, high=high)
+    low, high = seen.limits
+    return seen._replace(value=seen.value / nominal, limits=(low / nominal, high / nominal))
 
 
 def scaled(seen: Seen) -> Seen:
@@ -365,12 +350,13 @@ def scaled(seen: Seen) -> Seen:
     Raises:
         ConfigError: If a limit is infinite.
     """
-    if not np.isfinite([seen.low, seen.high]).all():
+    if not np.isfinite(seen.limits).all():
         raise seen.entry.error(
             f"{seen.name!r} needs 'min' and 'max' so that observations can be normalized"
         )
-    middle, half = (seen.low + seen.high) / 2, (seen.high - seen.low) / 2
-    return seen._replace(value=(seen.value - middle) / half, low=-1.0, high=1.0)
+    low, high = seen.limits
+    middle, half = (low + high) / 2, (high - low) / 2
+    return seen._replace(value=(seen.value - middle) / half, limits=(-1.0, 1.0))
 
 
 def remember(kept: list[History], first_step: int) -> Callable[[Any], None]:

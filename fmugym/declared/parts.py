@@ -84,6 +84,6 @@ def read_term(entry: Entry) -> Term:
     return Term(entry, expression, table.get("weight", 1.0), table.get("limit"))
 
 
-def read_limits(entry: Entry) -> Limits:
-    """Read ``min`` and ``max`` of a table; infinite where they are missing."""
-    return entry.value.get("min", -np.inf), entry.value.get("max", np.inf)
+def read_limits(entry: Entry, low: float = -np.inf, high: float = np.inf) -> Limits:
+    """Read ``min`` and ``max`` of a table, in the place of other limits."""
+    return entry.value.get("min", low), entry.value.get("max", high)

@@ -108,7 +108,7 @@ class Pilot:
 
         one: Any = self.controller
         if isinstance(one, Schedule):
-            return np.clip(one.at(self._clock(env)), self.variable.low, self.variable.high)
+            return np.clip(one.at(self._clock(env)), *self.variable.limits)
         rows = np.empty((len(env.step_count), len(self._names)), np.float32)
         for place, signal in enumerate(self._signals(env)):
             rows[:, place] = signal

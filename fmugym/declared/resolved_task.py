@@ -244,7 +244,7 @@ class ResolvedTask:
         return [variable for variable in self._declared.actions if variable.is_switched]
 
     def _is_on_at_start(self, variable: TaskVariable) -> float:
-        own = 0.0 if variable.in_fmu is None else variable.in_fmu.start_number
+        own = variable.fmu_variable.start_number
         _, start = self._declared.parameters.get(variable.alias, (variable, own))
         if is_distribution(start):
             raise variable.entry.error(f"the start value of {variable.alias!r} must not be drawn")
@@ -336,7 +336,7 @@ class ResolvedTask:
             and all(is_plain(variables[name]) for name in names)
         ):
             return None
-        return _box([(seen.low, seen.high) for seen in self._normalized])
+        return _box([seen.limits for seen in self._normalized])
 
     @cached_property
     def _normalized(self) -> list[Seen]:

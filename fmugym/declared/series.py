@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from fmugym.checks import check_integer, check_path, require_regular
 from fmugym.declared.entries import Entry
+from fmugym.declared.parts import Limits, read_limits
 from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
 from fmugym.errors import ConfigError, missing_file, reading, reason, shown, unknown_name
 from fmugym.extras import imported
@@ -44,7 +45,7 @@ class Series:
         times: Seconds since ``start``, rising.
         values: The values at these times, and between them on straight lines.
         is_stepped: Whether the values jump, and hold until the next one.
-        low, high: Limits for the observation space.
+        limits: For the observation space.
         unit: The unit of the values; None if none is declared.
     """
 
@@ -54,8 +55,7 @@ class Series:
     times: FloatArray
     values: FloatArray
     is_stepped: bool
-    low: float
-    high: float
+    limits: Limits
     unit: str | None
 
     @classmethod
@@ -83,10 +83,9 @@ class Series:
             values = np.repeat(values, 2)
         else:
             times, values = np.append(times, ends[-1]), np.append(values, wrapped[-1])
-        low = entry.value.get("min", float(values.min()))
-        high = entry.value.get("max", float(values.max()))
+        limits = read_limits(entry, float(values.min()), float(values.max()))
         unit = entry.value.get("unit")
-        return cls(entry, start, period, times, values, is_stepped, low, high, unit)
+        return cls(entry, start, period, times, values, is_stepped, limits, unit)
 
 
 def _require_rising(entry: Entry, times: FloatArray, values: FloatArray, period: float) -> None:

@@ -79,9 +79,9 @@ def _source(root: Entry, master: str | None) -> Path | FMUSystem:
 def _fmu_or_archive(entry: Entry, master: str | None) -> Path | FMUSystem:
     path = _path(entry)
     if path.suffix.lower() == ".ssp":
-        status = _status(entry, path)
+        state = _state(entry, path)
         with entry.placing(), _placing_load(entry):
-            return _read_archive(path, status.st_mtime_ns, status.st_size, master)
+            return _read_archive(*state, master)
     if master is not None:
         raise entry.error(f"a master is for systems; {path.name} is a single FMU")
     return path
@@ -112,13 +112,14 @@ def _path(entry: Entry) -> Path:
 def _system(section: Entry, master: str | None) -> FMUSystem:
     """Make the system that the section ``[system]`` declares, as far as it has no mistakes."""
     components: dict[str, Component] = {}
+    states: list[_State] = []
     for name, entry in section.child("components").items().items():
         with entry.noting():
-            components[name] = _component(entry)
+            components[name], state = _component(entry)
+            states.append(state)
     if not components:
         section.mistakes.require_none()
-    states = tuple(map(_version, components.values()))
-    key = repr(section.value), states, master
+    key = repr(section.value), tuple(states), master
     known = _known.get(key)
     if known is not None:
         return known
@@ -169,19 +170,12 @@ _known: Final[dict[Any, FMUSystem]] = {}
 """Systems by what declares them and the state of their FMUs: environments of a task share one."""
 
 
-def _component(entry: Entry) -> Component:
+def _component(entry: Entry) -> tuple[Component, _State]:
     fmu = entry if entry.child("fmu").value is None else entry.child("fmu")
     own = {name: entry.value[name] for name in table_of(Component).keys if name in entry.value}
-    path = _path(fmu)
-    _status(fmu, path)
+    state = _state(fmu, _path(fmu))
     with entry.placing():
-        return Component(**{**own, "fmu": path})
-
-
-def _version(component: Component) -> tuple[str, int, int]:
-    path = Path(component.fmu)  # type: ignore[arg-type]  # they are paths here
-    status = path.stat()
-    return str(path), status.st_mtime_ns, status.st_size
+        return Component(**{**own, "fmu": state[0]}), state
 
 
 def _describe(root: Entry, source: Path | FMUSystem) -> ModelDescription:
@@ -194,9 +188,9 @@ def _describe(root: Entry, source: Path | FMUSystem) -> ModelDescription:
     if isinstance(source, FMUSystem):
         return source.as_fmu().description
     entry = root.child("fmu")
-    status = _status(entry, source)
+    state = _state(entry, source)
     with _placing_load(entry):
-        description = _read_description(source, status.st_mtime_ns, status.st_size)
+        description = _read_description(*state)
     return _resized(description, root.child("parameters"))
 
 
@@ -209,10 +203,15 @@ def _resized(description: ModelDescription, parameters: Entry) -> ModelDescripti
     return description
 
 
-def _status(entry: Entry, path: Path) -> Any:
+_State = tuple[Path, int, int]
+"""A file, and what changes with its content."""
+
+
+def _state(entry: Entry, path: Path) -> _State:
     """The state of a file that must exist."""
     try:
-        return path.stat()
+        status = path.stat()
+        return path, status.st_mtime_ns, status.st_size
     except ordinary(OSError, ValueError):  # there is none, or no file could have such a name
         raise entry.error(missing_file("FMU", path, f"*{path.suffix or '.fmu'}")) from None
 

@@ -13,6 +13,7 @@ from fmugym.archive.variable import Variable
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
 from fmugym.declared.mistakes import ConsequenceError
+from fmugym.declared.parts import Limits
 from fmugym.declared.quantities import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -46,7 +47,7 @@ class TaskVariable:
             action that only expressions read.
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
-        low, high: The limits in the unit of the task; infinite where there are none.
+        limits: Those in the unit of the task; infinite where there are none.
         nominal: The usual size of its values; None if neither the task nor the FMU says it.
         levels: The values that an action chooses from; empty for a continuous one.
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
@@ -60,8 +61,7 @@ class TaskVariable:
     in_fmu: Variable | None
     unit: str | None
     conversion: Conversion
-    low: float
-    high: float
+    limits: Limits
     levels: tuple[float, ...] = ()
     nominal: float | None = None
     delta: float = 0.0
@@ -80,12 +80,12 @@ class TaskVariable:
         return self.min_on > 0 or self.min_off > 0
 
     @property
-    def range(self) -> tuple[float, float]:
+    def range(self) -> Limits:
         """The lowest and the highest value of an action."""
-        return (min(self.levels), max(self.levels)) if self.levels else (self.low, self.high)
+        return (min(self.levels), max(self.levels)) if self.levels else self.limits
 
     @property
-    def chosen(self) -> tuple[float, float]:
+    def chosen(self) -> Limits:
         """The lowest and the highest value, or change of it, that an agent chooses."""
         return (-self.delta, self.delta) if self.delta else self.range
 
@@ -102,11 +102,6 @@ class TaskVariable:
                 f'{self.alias} = {{ name = "..." }}'
             )
         return self.in_fmu
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether both limits are finite."""
-        return math.isfinite(self.low) and math.isfinite(self.high)
 
 
 class TaskVariables:
@@ -269,36 +264,26 @@ class TaskVariables:
         limited = None if sample == "integral" else in_fmu
         if "delta" in given and "levels" in given:
             raise entry.error("an action has either 'levels' or 'delta'")
-        low, high = _limits(entry, limited, conversion)
+        limits = _limits(entry, limited, conversion)
         if in_fmu is not None:
-            ends = sorted(map(conversion.inverse, (low, high)))
+            ends = sorted(map(conversion.inverse, limits))
             bounds = (ends[0], ends[1]) if given.keys() & {"min", "max"} else None
             in_fmu = replace(in_fmu, bounds=bounds, sampling=sample)
         return TaskVariable(
-            *(alias, entry, in_fmu, unit, conversion, low, high),
+            *(alias, entry, in_fmu, unit, conversion, limits),
             nominal=given.get("nominal", _own_nominal(limited, conversion)),
             device=read_device(entry),
             **{key: given[key] for key in _PLAIN if key in given},
         )
 
 
-def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
+def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> Limits:
     """The limits of the task, or else those of the FMU."""
-    given, (low, high) = entry.value or {}, _own_limits(variable, conversion)
+    own = (-math.inf, math.inf) if variable is None else variable.extremes
+    given, (low, high) = entry.value or {}, sorted(map(conversion, own))
     low, high = given.get("min", low), given.get("max", high)
     if not low < high and given.keys() & {"min", "max"}:
         raise entry.error(f"min must be below max, got {low:g} and {high:g}")
-    return low, high
-
-
-def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
-    if variable is None:
-        return -math.inf, math.inf
-    if variable.kind == "boolean":
-        return 0.0, 1.0
-    values: list[float] = [value for _, value in variable.items]
-    limits = (min(values), max(values)) if values else (variable.minimum, variable.maximum)
-    low, high = sorted(map(conversion, limits))
     return low, high
 
 
@@ -320,7 +305,12 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
     Raises:
         ConfigError: If the variable cannot be set, or the value does not fit it.
     """
-    in_fmu = _settable(variable, entry)
+    in_fmu = variable.fmu_variable
+    if not in_fmu.settable_at_start:
+        raise entry.error(
+            f"{in_fmu.name!r} cannot be set at the start of an episode: it is a "
+            f"{in_fmu.variability} {in_fmu.causality}"
+        )
     if in_fmu.shape:
         return _array_start(in_fmu, entry)
     value, is_text = entry.value, bool(in_fmu.items) or in_fmu.kind == "string"
@@ -331,27 +321,6 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
         if in_fmu.kind == "string":
             return value
         return within(in_fmu, checked(in_fmu, value))
-
-
-def fitted_value(variable: TaskVariable, entry: Entry, value: Any) -> Any:
-    """A distribution of a parameter that is in the unit of the FMU already.
-
-    Raises:
-        ConfigError: As ``start_value``.
-    """
-    in_fmu = _settable(variable, entry)
-    with entry.placing():
-        return within(in_fmu, checked(in_fmu, value))
-
-
-def _settable(variable: TaskVariable, entry: Entry) -> Variable:
-    in_fmu = variable.fmu_variable
-    if not in_fmu.settable_at_start:
-        raise entry.error(
-            f"{in_fmu.name!r} cannot be set at the start of an episode: it is a "
-            f"{in_fmu.variability} {in_fmu.causality}"
-        )
-    return in_fmu
 
 
 def _array_start(variable: Variable, entry: Entry) -> Any:

@@ -107,8 +107,6 @@ def _blame(env: Any, action: Any, error: BaseException) -> ConfigError | None:
 
 def _is_element(action: Any, elements: Collection[int]) -> bool:
     """Whether an action is one of the elements of a ``Discrete``."""
-    if type(action) is int:
-        return action in elements
     try:
         return operator.index(action) in elements
     except ordinary(Exception):  # a TypeError, or whatever the object's method raises

@@ -179,10 +179,10 @@ class Constructed(Pictured):
         def present() -> Any:
             return self.inside.readings.values
 
-        texts = NamedTexts(names, strings, present)
+        named = NamedTexts if strings else NamedValues
         return Readings(
             values=values,
-            out=texts if strings else NamedValues("output", names, present),
+            out=named("output", names, present, strings),
             state=state,
             previous_state=state,
             inputs=tuple(start for _, start in self.inside.start_inputs),

@@ -93,21 +93,12 @@ def _space(variables: tuple[Variable, ...]) -> spaces.Space[Any]:
     if all(variable.kind == "boolean" for variable in variables):
         return spaces.MultiBinary(len(variables))
     with np.errstate(over="ignore"):  # beyond float32 there is no limit
-        limits = np.array([_box_limits(v) for v in variables], dtype=np.float32)
+        limits = np.array([_range_of(v) for v in variables], dtype=np.float32)
     return spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
 
 
-def _box_limits(variable: Variable) -> tuple[float, float]:
-    if variable.kind == "boolean":
-        return 0.0, 1.0
-    if variable.items:
-        values = [value for _, value in variable.items]
-        return min(values), max(values)
-    return _range_of(variable)
-
-
 def _range_of(variable: Variable) -> tuple[float, float]:
-    low, high = variable.range
+    low, high = variable.extremes
     if not low <= high:
         raise ConfigError(
             f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds', "

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from copy import copy
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -46,18 +47,20 @@ class NamedValues(Mapping[str, Any]):
         kind: What the names refer to, for error texts.
         names: The names, in the order of the values.
         get_values: Returns the current values.
+        strings: Those of the names whose values are texts; see ``NamedTexts``.
 
     Raises:
         ConfigError: If ``[]`` gets an unknown name; the text suggests the nearest one.
     """
 
-    strings: frozenset[str] = frozenset()
-    """Those of the names whose values are texts."""
-
     def __init__(
-        self, kind: str, names: Sequence[str], get_values: Callable[[], Sequence[Any]]
+        self,
+        kind: str,
+        names: Sequence[str],
+        get_values: Callable[[], Sequence[Any]],
+        strings: frozenset[str] = frozenset(),
     ) -> None:
-        self._kind = kind
+        self._kind, self.strings = kind, strings
         self._index = {name: index for index, name in enumerate(names)}
         self._get_values = get_values
         self._found_arrays: dict[str, list[int]] | None = None
@@ -109,9 +112,11 @@ class NamedValues(Mapping[str, Any]):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({dict(self)})"
 
-    def over(self, get_values: Callable[[], Sequence[Any]]) -> NamedValues:
+    def over(self, get_values: Callable[[], Sequence[Any]]) -> Self:
         """The same names, in the same order, with other values."""
-        return NamedValues(self._kind, list(self._index), get_values)
+        other = copy(self)
+        other._get_values = get_values
+        return other
 
 
 class NamedTexts(NamedValues):
@@ -119,18 +124,7 @@ class NamedTexts(NamedValues):
 
     Among the values, these are the numbers of their texts. ``[]`` returns the texts: a text for a
     number, an array of texts for an array of numbers.
-
-    Args:
-        names: The names, in the order of the values.
-        strings: Those of the Strings.
-        get_values: Returns the current values.
     """
-
-    def __init__(
-        self, names: Sequence[str], strings: frozenset[str], get_values: Callable[[], Sequence[Any]]
-    ) -> None:
-        super().__init__("output", names, get_values)
-        self.strings = strings
 
     def __getitem__(self, name: str) -> Any:
         value = super().__getitem__(name)
@@ -138,10 +132,6 @@ class NamedTexts(NamedValues):
 
     def _shown(self, name: str, value: Any) -> Any:
         return texts_of(value)
-
-    def over(self, get_values: Callable[[], Sequence[Any]]) -> NamedTexts:
-        """See ``NamedValues.over``."""
-        return type(self)(list(self), self.strings, get_values)
 
 
 class ParameterValues(dict[str, Any]):

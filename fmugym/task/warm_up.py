@@ -139,8 +139,7 @@ class WarmUps:
             if first:
                 where = np.array(first)
                 beginning.place(self._run(pool, beginning.start(where), where), where)
-            for written, where in self._restore(pool, found):
-                beginning.place(written, where)
+            self._restore(beginning, found)
             left = [index for index in left if index not in found and index not in first]
 
     # States that are known
@@ -188,17 +187,14 @@ class WarmUps:
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
 
-    def _restore(self, pool: Pool, found: Found) -> list[tuple[dict[str, Any], IndexArray]]:
-        """Bring FMUs to states that were found.
-
-        Returns:
-            The episode variables that warm-ups have written, each time with the environments.
-        """
+    def _restore(self, beginning: Beginning, found: Found) -> None:
+        """Bring FMUs to states that were found, each state once to all that begin with it."""
         groups: dict[bytes, list[int]] = {}
         for index, warmed in found.items():
             groups.setdefault(warmed, []).append(index)
-        pairs = [(warmed, np.array(indices)) for warmed, indices in groups.items()]
-        return [(self._restored(pool, *pair), pair[1]) for pair in pairs]
+        for warmed, indices in groups.items():
+            where = np.array(indices)
+            beginning.place(self._restored(beginning.pool, warmed, where), where)
 
     def _restored(self, pool: Pool, warmed: bytes, indices: IndexArray) -> dict[str, Any]:
         inputs, *parts = np.split(np.frombuffer(warmed[: self._size]), self._ends[:-1])

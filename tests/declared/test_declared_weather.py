@@ -183,7 +183,7 @@ class TestMissing:
         for number, (text, _) in coded.items():
             series, value = read(path, number), float(text)
             assert set(series.values) == {value}
-            assert (series.low, series.high, series.period) == (value, value, 172800)
+            assert (series.limits, series.period) == ((value, value), 172800)
 
     def test_a_gap_in_a_slope(self, tmp_path):
         values = [*range(1, 10), 99.9, 99.9, *range(12, 25)]

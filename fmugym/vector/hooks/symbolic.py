@@ -37,7 +37,9 @@ def symbolic_readings(
 
     values, strings = rows((len(env.out),), "output"), env.fmu.description.strings
     read = batched(env, LANES, values, rows((len(env.inside.interface.inputs),), "input"))
-    read.out = _SymbolicOutputs(list(env.out), strings.intersection(env.out), lambda: values)
+    read.out = _SymbolicOutputs(
+        "output", list(env.out), lambda: values, strings.intersection(env.out)
+    )
     kept = rows((len(env.out),), "kept") if judging else values
     read.previous_state = kept[: env.inside.output_count]
     for name in ("action", "previous_action"):
