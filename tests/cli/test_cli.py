@@ -71,10 +71,11 @@ def make_fmu(tmp_path):
 
 
 @pytest.fixture
-def info(capsys):
+def info(cli):
     def call(path, *options):
-        assert main(["info", str(path), *options]) == 0
-        return capsys.readouterr().out
+        code, out, _ = cli("info", path, *options)
+        assert code == 0
+        return out
 
     return call
 
@@ -361,9 +362,10 @@ class TestSkeleton:
         assert "no numeric input" in made.err
         assert "locals" in made.err
 
-    def test_nothing_to_observe_is_an_error(self, make_fmu, capsys):
-        assert main(["new", "--class", str(make_fmu(INPUT))]) == 1
-        assert "to observe" in capsys.readouterr().err
+    def test_nothing_to_observe_is_an_error(self, make_fmu, cli):
+        code, _, err = cli("new", "--class", make_fmu(INPUT))
+        assert code == 1
+        assert "to observe" in err
 
     def test_runs_for_an_fmu_without_inputs_of_another_exporter(self, tmp_path):
         fmu = FmuBuilder.build_FMU(foreign_talker.__file__, tmp_path)
@@ -371,23 +373,23 @@ class TestSkeleton:
 
 
 class TestNew:
-    def test_what_it_leaves_out_is_counted(self, make_fmu, capsys):
+    def test_what_it_leaves_out_is_counted(self, make_fmu, cli):
         rows = [parameter(f"p{n}", f'<Real start="{n}"/>') for n in range(47)]
-        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
-        made = capsys.readouterr()
-        assert [f"# p{n} = {n}.0" in made.out for n in (39, 40)] == [True, False]
-        assert "# 7 more are listed by: fmugym info" in made.out
-        assert "7 parameters are left out; 'fmugym info' lists them" in made.err
+        code, out, err = cli("new", make_fmu(INPUT, OUTPUT, *rows))
+        assert code == 0
+        assert [f"# p{n} = {n}.0" in out for n in (39, 40)] == [True, False]
+        assert "# 7 more are listed by: fmugym info" in out
+        assert "7 parameters are left out; 'fmugym info' lists them" in err
 
-    def test_locals_that_look_like_results_are_listed(self, make_fmu, capsys):
+    def test_locals_that_look_like_results_are_listed(self, make_fmu, cli):
         """As comments: each is a line of [variables] once its # is gone."""
         real = '<Real unit="{}"/>'
         wanted = {"room.T[1]": "degC", "P": "W", "E.total": "kWh"}
         rows = [variable(name, real.format(unit), "local") for name, unit in wanted.items()]
         rows += [variable("room.T_start", real.format("K"), "local", "fixed")]
         rows += [variable("der(x)", real.format("m/s"), "local"), variable("n", "<Real/>", "local")]
-        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
-        text = capsys.readouterr().out
+        code, text, _ = cli("new", make_fmu(INPUT, OUTPUT, *rows))
+        assert code == 0
         table = text[text.index("# These locals") :].partition("\n[setpoints]")[0]
         table = re.sub(r"^# ", "", table.partition("\n")[2], flags=re.M)
         assert {row["name"] for row in tomllib.loads(table).values()} == wanted.keys()
@@ -420,9 +422,9 @@ class TestCommand:
         assert done.stderr.startswith("fmugym: error: there is no FMU at")
         assert done.stderr.count("\n") == 1
 
-    def test_an_id_that_does_not_exist_has_one_nearest_name(self, capsys):
-        assert main(["bench", "fmugym/CartPol-v0"]) == 1
-        said = capsys.readouterr().err
+    def test_an_id_that_does_not_exist_has_one_nearest_name(self, cli):
+        code, _, said = cli("bench", "fmugym/CartPol-v0")
+        assert code == 1
         assert said.count("Did you mean") == 1
         assert "'fmugym/CartPole-v0'" in said
 
@@ -444,16 +446,15 @@ class TestCommand:
             assert f"\n  {example}\n" in said
             assert example in documents
 
-    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(self, tmp_path, capsys):
+    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(self, tmp_path, cli):
         fmu, file = str(fmugym.bundled_fmu("Pendulum")), tmp_path / "a.toml"
         file.write_text("precious")
-        assert main(["new", fmu, "--output", str(file)]) == 1
-        assert (
-            "a.toml exists; name a new one, or replace it with --force" in capsys.readouterr().err
-        )
-        assert main(["new", fmu + "x", "--output", str(file), "--force"]) == 1
+        code, _, err = cli("new", fmu, "--output", file)
+        assert code == 1
+        assert "a.toml exists; name a new one, or replace it with --force" in err
+        assert cli("new", fmu + "x", "--output", file, "--force")[0] == 1
         assert file.read_text() == "precious"
-        assert main(["new", fmu, "--output", str(file), "--force"]) == 0
+        assert cli("new", fmu, "--output", file, "--force")[0] == 0
         assert "time_step" in file.read_text()
         assert sorted(tmp_path.iterdir()) == [file, tmp_path / "fmugym.schema.json"]
 
@@ -480,19 +481,20 @@ class TestCommand:
         assert err.startswith("fmugym: error: ")
         assert set(tmp_path.iterdir()) == wrong
 
-    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, capsys):
+    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, cli):
         file = tmp_path / "run.csv"
         file.write_text("precious")
-        assert main(["simulate", "absent.toml", "--output", str(file)]) == 1
-        assert "run.csv exists" in capsys.readouterr().err
+        code, _, err = cli("simulate", "absent.toml", "--output", file)
+        assert code == 1
+        assert "run.csv exists" in err
 
-    def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, capsys):
-        fmu = str(make_fmu(INPUT, OUTPUT))
+    def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, cli):
+        fmu = make_fmu(INPUT, OUTPUT)
         for options, notes in (([], True), (["-q"], False)):
-            assert main(["new", fmu, *options]) == 0
-            printed = capsys.readouterr()
-            assert "time_step" in printed.out
-            assert bool(printed.err) is notes
+            code, out, err = cli("new", fmu, *options)
+            assert code == 0
+            assert "time_step" in out
+            assert bool(err) is notes
 
     @pytest.mark.parametrize(("option", "told"), [("-v", "0 1 2"), ("-q", "2")])
     def test_the_log_of_this_command_only(self, option, told, capsys):
@@ -564,7 +566,7 @@ class TestCommand:
         assert done.returncode == 0, done.stderr
         assert r"25 \xb0C" in done.stdout
 
-    def test_letters_of_other_languages_stay(self, info, make_fmu, tmp_path):
+    def test_letters_of_other_languages_stay(self, info, make_fmu, tmp_path, cli):
         described = variable("u", '<Real start="0"/>', description="Außentemperatur 温度")
         path = make_fmu(described, OUTPUT).rename(tmp_path / "Übung größer.fmu")
         text = info(path)
@@ -572,5 +574,5 @@ class TestCommand:
         assert "Außentemperatur 温度" in text
         for kind in ([], ["--class"]):
             made = tmp_path / f"made{len(kind)}"
-            assert main(["new", str(path), *kind, "--output", str(made)]) == 0
+            assert cli("new", path, *kind, "--output", made)[0] == 0
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")

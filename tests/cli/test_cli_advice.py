@@ -22,7 +22,6 @@ import fmugym
 from fmugym.declared import Task, load
 from fmugym.tools import advice as advice_tools
 from fmugym.tools.accuracy import Replay, substeps_of
-from fmugym.tools.cli import main
 from fmugym.tools.findings import lines_of
 from fmugym.tools.validation import validate
 
@@ -94,11 +93,12 @@ def test_needless_substeps_are_told(lag, monkeypatch):
     assert 2 <= advice["substeps"] <= 16
 
 
-def test_lines_can_be_written_into_the_file(lag, tmp_path, capsys):
+def test_lines_can_be_written_into_the_file(lag, tmp_path, cli):
     path = tmp_path / "a.toml"
     lag_task(lag, 1000.0).write(path)
-    assert main(["validate", str(path)]) in (0, 1)
-    _, _, lines = capsys.readouterr().out.partition("for the task file:\n")
+    code, out, _ = cli("validate", path)
+    assert code in (0, 1)
+    _, _, lines = out.partition("for the task file:\n")
     document = tomllib.loads(path.read_text())
     pasted = tomllib.loads(lines)
     assert pasted["substeps"] > 25
@@ -216,13 +216,14 @@ class TestEpisodeLength:
 
 
 @pytest.mark.parametrize("reward", ["-1e-6 * q**2", "-1 - 1e-11 * q**2", "2 + 1e-11 * q"])
-def test_a_tiny_reward_beside_large_actions_gets_lines(reward, tmp_path, capsys):
+def test_a_tiny_reward_beside_large_actions_gets_lines(reward, tmp_path, cli):
     """With them, rewards have the size of 1, and begin near 0."""
     variables = {"tau": {"min": -200, "max": 200}}
     task = pendulum(variables=variables, reward=reward, time_step=0.001, episode_length=0.05)
     task.write(tmp_path / "a.toml")
-    assert main(["validate", str(tmp_path / "a.toml")]) in (0, 1)
-    _, _, lines = capsys.readouterr().out.partition("for the task file:\n")
+    code, out, _ = cli("validate", tmp_path / "a.toml")
+    assert code in (0, 1)
+    _, _, lines = out.partition("for the task file:\n")
     pasted = tomllib.loads(lines)
     assert pasted["agent"]["rescale"] is True
     env = load(Task.from_dict({**task.document, "reward": pasted["reward"]}))

@@ -9,7 +9,6 @@ import gymnasium
 import pygame
 import pytest
 
-from fmugym.tools.cli import main
 from fmugym.tools.demo import arena_of_demo, train
 
 
@@ -47,16 +46,19 @@ def test_it_gives_up_after_the_most_rounds():
     assert len(trained(0, most=1)) == 1
 
 
-def test_without_a_display_it_writes_a_picture(tmp_path, capsys):
+def test_without_a_display_it_writes_a_picture(tmp_path, cli):
     path = tmp_path / "demo.png"
-    assert main(["demo", "--output", str(path)]) == 0
-    assert "of 500" in capsys.readouterr().out
+    code, out, _ = cli("demo", "--output", path)
+    assert code == 0
+    assert "of 500" in out
     width, height = pygame.image.load(path).get_size()
     assert width > 2 * height
-    assert main(["demo", "--output", str(path)]) == 1
-    assert "demo.png" in capsys.readouterr().err
-    assert main(["demo", "--output", str(tmp_path / "demo.jpg")]) == 1
-    assert "demo.jpg" in capsys.readouterr().err
+    code, _, err = cli("demo", "--output", path)
+    assert code == 1
+    assert "demo.png" in err
+    code, _, err = cli("demo", "--output", tmp_path / "demo.jpg")
+    assert code == 1
+    assert "demo.jpg" in err
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="takes the display away as X11 has it")
