@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import re
 import shlex
 import subprocess
@@ -18,6 +17,7 @@ import quirk_table
 import zoo_tools
 from fmu_tools import HERE, library_name, probe_fmu, read_fmu
 from plants import ONCE
+from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
@@ -35,8 +35,7 @@ XML = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def run(*arguments, **options):
-    command = [sys.executable, "-m", "fmugym", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+    return run_python("-m", "fmugym", *arguments, **options)
 
 
 def variable(name, inner, causality="input", variability="continuous", **attributes):
@@ -399,8 +398,7 @@ class TestNew:
 def assert_skeleton_runs(fmu, folder, *options):
     """Write a skeleton into a folder and run it."""
     assert main(["new", "--class", str(fmu), "--output", str(folder / "made.py"), "--force"]) == 0
-    command = [sys.executable, *options, "made.py"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    done = run_python(*options, "made.py", cwd=folder, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "keeps the contract" in done.stdout
 
@@ -529,9 +527,8 @@ class TestCommand:
         """The program ``fmugym`` has its own folder in front, not the working directory."""
         text = "from fmugym.envs import CartPoleEnv\n\n\nclass Drive(CartPoleEnv):\n    pass\n"
         (tmp_path / "drive.py").write_text(text)
-        command = [sys.executable, "-P" if "-c" in program else "-B", *program]
-        command += ["simulate", "drive:Drive", "--steps", "3"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        command = "-P" if "-c" in program else "-B", *program, "simulate", "drive:Drive"
+        done = run_python(*command, "--steps", 3, cwd=tmp_path)
         assert "reward 3 in 3 steps" in done.stdout, done.stderr
 
     def test_version(self, capsys):
@@ -554,15 +551,13 @@ class TestCommand:
 
     def test_output_fits_the_narrowest_console(self, make_fmu):
         path = make_fmu(INPUT, OUTPUT, description="25 \u00b0C")
-        environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
         commands = [
             ["info", str(path)],
             ["info", str(path), "--json"],
             ["new", "--class", str(path)],
         ]
         program = f"from fmugym.tools.cli import main\nassert not any(map(main, {commands}))"
-        command = [sys.executable, "-c", program]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        done = run_python("-c", program, environment={"PYTHONIOENCODING": "ascii:strict"})
         assert done.returncode == 0, done.stderr
         assert r"25 \xb0C" in done.stdout
 

@@ -1,9 +1,7 @@
 """The settings that ``fmugym validate`` recommends, for models whose needs are known."""
 
 import math
-import os
 import re
-import subprocess
 import sys
 import tomllib
 from dataclasses import replace
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 import zoo_tools
 from gymnasium import spaces
+from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
@@ -366,8 +365,7 @@ def test_what_an_fmu_prints_is_not_in_the_output(tmp_path, options):
     """It prints whenever an instance is made, also while the process ends."""
     calls = zoo_tools.FAULTS.index("print"), zoo_tools.CALLS.index("instantiate")
     path = zoo_tools.zoo_fmu(tmp_path, 2, "{{zoo {} {} 0}}".format(*calls))
-    command = [sys.executable, "-m", "fmugym", "validate", str(path), *options]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = run_python("-m", "fmugym", "validate", path, *options, cwd=tmp_path)
     assert done.returncode == 0
     printed = "a line of the zoo"
     assert printed not in done.stdout
@@ -381,8 +379,7 @@ def test_what_an_fmu_prints_is_not_in_the_output(tmp_path, options):
 
 
 def test_nothing_is_told_and_no_file_stays_if_an_fmu_prints_nothing(tmp_path):
-    command = [sys.executable, "-m", "fmugym", "bench", "fmugym/CartPole-v0", "--seconds", "0.01"]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    command = "bench", "fmugym/CartPole-v0", "--seconds", "0.01"
+    done = run_python("-m", "fmugym", *command, environment={"TMPDIR": str(tmp_path)})
     assert (done.returncode, done.stderr) == (0, "")
     assert list(tmp_path.iterdir()) == []

@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from process_tools import run_python
 from source_tools import write_source_fmu
 
 import fmugym
@@ -60,8 +61,8 @@ def completions(line, shell, file):
         "_ARGCOMPLETE_IFS": "\n",
         "_ARGCOMPLETE_STDOUT_FILENAME": str(file),
     }
-    program = [sys.executable, "-c", "from fmugym.tools.cli import main; main()"]
-    subprocess.run(program, env=os.environ | settings, check=True, capture_output=True)
+    program = "from fmugym.tools.cli import main; main()"
+    run_python("-c", program, environment=settings, check=True)
     return [re.split(r"[:\t]", one)[0].strip() for one in file.read_text().splitlines()]
 
 

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tomllib
 
-import building
 import pytest
 from combinations import in_turn
 from fmu_tools import HERE, edited_fmu, library_name
@@ -55,8 +54,6 @@ def fmu_path(request, probe, tmp_path_factory):
 def play(fmu_path, environment=(), **config):
     """Play some steps in a process of its own, after a trial; returns what came of it."""
     script = f"""
-import sys
-sys.path[:0] = {building.FOLDERS!r}
 import fmugym
 from fmu_tools import PlainEnv, probe_config
 try:
@@ -70,9 +67,8 @@ try:
 except fmugym.FMULoadError as error:
     print(error)
 """
-    variables = {**os.environ, "FMUGYM_PROBE": "on", **dict(environment)}
-    command = [sys.executable, "-W", "error", "-c", script]
-    done = subprocess.run(command, capture_output=True, text=True, env=variables, timeout=120)
+    variables = {"FMUGYM_PROBE": "on", **dict(environment)}
+    done = run_python("-W", "error", "-c", script, environment=variables)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip().splitlines()[-1]
 
@@ -162,7 +158,7 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
     assert f'\npreload = ["./{name}"]' in task.read_text()
     monkeypatch.setenv("FMUGYM_PROBE", "on")
     # not in this process, which may have loaded another library of that name
-    played = run_python("-m", "fmugym", "simulate", str(task), "--steps", "2")
+    played = run_python("-m", "fmugym", "simulate", task, "--steps", 2)
     assert played.returncode == 0, played.stderr
     code, said, _ = cli("info", task)
     assert code == 0
