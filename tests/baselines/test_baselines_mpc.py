@@ -425,7 +425,7 @@ class TestRefusals:
 
 class TestCommandLine:
     @pytest.fixture
-    def everyone(self, tmp_path, monkeypatch, cli):
+    def everyone(self, tmp_path, monkeypatch, ran):
         """Who is compared, and the options for it; starts are drawn."""
         start = {"distribution": "uniform", "low": -0.5, "high": 0.5}
         ahead = "mpc horizon=1h candidates=64"
@@ -434,19 +434,17 @@ class TestCommandLine:
         monkeypatch.chdir(tmp_path)
         fmugym.Task.of(task).write(tmp_path / "drawn.toml")
         trained = ["--output", "agent", "--rounds", "9", "--episodes", "1"]
-        assert cli("train", "drawn.toml", *trained)[0] == 0
+        ran("train", "drawn.toml", *trained)
         names = ["pi", "ahead", f"{ahead} perfect=true"]
         asked = [word for name in names for word in ("--controller", name)]
         played = ["--agent", "agent", "--steps", "8", "--episodes", "3"]
         return [*names, "agent"], ["drawn.toml", *asked, *played]
 
-    def test_compares_it_with_others(self, everyone, tmp_path, cli):
+    def test_compares_it_with_others(self, everyone, tmp_path, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         names, options = everyone
         picture = tmp_path / "scores.svg"
-        code, out, _ = cli("evaluate", *options, "--plot", picture, "--json")
-        assert code == 0
-        scores = json.loads(out)["scores"]
+        scores = json.loads(ran("evaluate", *options, "--plot", picture, "--json"))["scores"]
         pid, ahead, perfect, agent = (next(s for s in scores if s["name"] == n) for n in names)
         assert pid["gains"] == []
         for one in (ahead, perfect, agent):
@@ -460,11 +458,11 @@ class TestCommandLine:
         assert "gain beside" in "".join(drawn)
         assert [text for text in drawn if text in names] == [*names, names[0]]
 
-    def test_a_report_shows_it_beside_others(self, everyone, tmp_path, cli):
+    def test_a_report_shows_it_beside_others(self, everyone, tmp_path, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         names, options = everyone
         page = tmp_path / "report.html"
-        assert cli("simulate", *options, "--output", page)[0] == 0
+        ran("simulate", *options, "--output", page)
         means = page.read_text().split("<table>")[1].replace("\u2212", "-")
         head, *rows = (re.findall("<t[dh].*?>(.*?)</t", row) for row in means.split("<tr>")[1:])
         assert head == ["", "episodes", "reward", "± (95 %)", "gain", "± (95 %)"]
@@ -475,12 +473,11 @@ class TestCommandLine:
             assert float(row[4]) == pytest.approx(gain, abs=2e-3)
             assert 0 < float(row[5]) < 0.5 * float(row[3])
 
-    def test_thinking_ahead_costs_least_in_a_house(self, cli):
+    def test_thinking_ahead_costs_least_in_a_house(self, ran):
         pid, ahead = "pid of=T setpoint=21 kp=1.3 ti=2000", "mpc horizon=24h candidates=64"
         asked = [word for name in (pid, ahead) for word in ("--controller", name)]
         played = ["--scenario", "frost", "--steps", "192", "--episodes", "1", "--json"]
-        code, out, _ = cli("evaluate", "fmugym/House-v0", *asked, *played)
-        assert code == 0
+        out = ran("evaluate", "fmugym/House-v0", *asked, *played)
         _, tuned, planned = json.loads(out)["scores"]
         assert planned["mean_reward"] > 0.98 * tuned["mean_reward"]
 
@@ -501,9 +498,8 @@ class TestCommandLine:
         assert "slow" not in test
         assert "left out: slow, whose test would take about" in err
 
-    def test_its_numbers_are_not_tuned(self, cli):
-        code, _, err = cli("tune", "fmugym/Pendulum-v0", "mpc horizon=3600..7200")
-        assert code == 1
+    def test_its_numbers_are_not_tuned(self, refused):
+        err = refused("tune", "fmugym/Pendulum-v0", "mpc horizon=3600..7200")
         assert "'mpc' cannot be tuned; known are: hysteresis, pid" in err
 
     def test_it_does_not_act_in_a_warm_up(self, env_of):

@@ -70,13 +70,8 @@ def make_fmu(tmp_path):
 
 
 @pytest.fixture
-def info(cli):
-    def call(path, *options):
-        code, out, _ = cli("info", path, *options)
-        assert code == 0
-        return out
-
-    return call
+def info(ran):
+    return lambda path, *options: ran("info", path, *options)
 
 
 @pytest.fixture
@@ -361,10 +356,8 @@ class TestSkeleton:
         assert "no numeric input" in made.err
         assert "locals" in made.err
 
-    def test_nothing_to_observe_is_an_error(self, make_fmu, cli):
-        code, _, err = cli("new", "--class", make_fmu(INPUT))
-        assert code == 1
-        assert "to observe" in err
+    def test_nothing_to_observe_is_an_error(self, make_fmu, refused):
+        assert "to observe" in refused("new", "--class", make_fmu(INPUT))
 
     def test_runs_for_an_fmu_without_inputs_of_another_exporter(self, tmp_path):
         fmu = FmuBuilder.build_FMU(foreign_talker.__file__, tmp_path)
@@ -380,15 +373,14 @@ class TestNew:
         assert "# 7 more are listed by: fmugym info" in out
         assert "7 parameters are left out; 'fmugym info' lists them" in err
 
-    def test_locals_that_look_like_results_are_listed(self, make_fmu, cli):
+    def test_locals_that_look_like_results_are_listed(self, make_fmu, ran):
         """As comments: each is a line of [variables] once its # is gone."""
         real = '<Real unit="{}"/>'
         wanted = {"room.T[1]": "degC", "P": "W", "E.total": "kWh"}
         rows = [variable(name, real.format(unit), "local") for name, unit in wanted.items()]
         rows += [variable("room.T_start", real.format("K"), "local", "fixed")]
         rows += [variable("der(x)", real.format("m/s"), "local"), variable("n", "<Real/>", "local")]
-        code, text, _ = cli("new", make_fmu(INPUT, OUTPUT, *rows))
-        assert code == 0
+        text = ran("new", make_fmu(INPUT, OUTPUT, *rows))
         table = text[text.index("# These locals") :].partition("\n[setpoints]")[0]
         table = re.sub(r"^# ", "", table.partition("\n")[2], flags=re.M)
         assert {row["name"] for row in tomllib.loads(table).values()} == wanted.keys()
@@ -420,9 +412,8 @@ class TestCommand:
         assert done.stderr.startswith("fmugym: error: there is no FMU at")
         assert done.stderr.count("\n") == 1
 
-    def test_an_id_that_does_not_exist_has_one_nearest_name(self, cli):
-        code, _, said = cli("bench", "fmugym/CartPol-v0")
-        assert code == 1
+    def test_an_id_that_does_not_exist_has_one_nearest_name(self, refused):
+        said = refused("bench", "fmugym/CartPol-v0")
         assert said.count("Did you mean") == 1
         assert "'fmugym/CartPole-v0'" in said
 
@@ -444,15 +435,16 @@ class TestCommand:
             assert f"\n  {example}\n" in said
             assert example in documents
 
-    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(self, tmp_path, cli):
+    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(
+        self, tmp_path, ran, refused
+    ):
         fmu, file = str(fmugym.bundled_fmu("Pendulum")), tmp_path / "a.toml"
         file.write_text("precious")
-        code, _, err = cli("new", fmu, "--output", file)
-        assert code == 1
+        err = refused("new", fmu, "--output", file)
         assert "a.toml exists; name a new one, or replace it with --force" in err
-        assert cli("new", fmu + "x", "--output", file, "--force")[0] == 1
+        refused("new", fmu + "x", "--output", file, "--force")
         assert file.read_text() == "precious"
-        assert cli("new", fmu, "--output", file, "--force")[0] == 0
+        ran("new", fmu, "--output", file, "--force")
         assert "time_step" in file.read_text()
         assert sorted(tmp_path.iterdir()) == [file, tmp_path / "fmugym.schema.json"]
 
@@ -479,12 +471,10 @@ class TestCommand:
         assert err.startswith("fmugym: error: ")
         assert set(tmp_path.iterdir()) == wrong
 
-    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, cli):
+    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, refused):
         file = tmp_path / "run.csv"
         file.write_text("precious")
-        code, _, err = cli("simulate", "absent.toml", "--output", file)
-        assert code == 1
-        assert "run.csv exists" in err
+        assert "run.csv exists" in refused("simulate", "absent.toml", "--output", file)
 
     def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, cli):
         fmu = make_fmu(INPUT, OUTPUT)
@@ -561,7 +551,7 @@ class TestCommand:
         assert done.returncode == 0, done.stderr
         assert r"25 \xb0C" in done.stdout
 
-    def test_letters_of_other_languages_stay(self, info, make_fmu, tmp_path, cli):
+    def test_letters_of_other_languages_stay(self, info, make_fmu, tmp_path, ran):
         described = variable("u", '<Real start="0"/>', description="Außentemperatur 温度")
         path = make_fmu(described, OUTPUT).rename(tmp_path / "Übung größer.fmu")
         text = info(path)
@@ -569,5 +559,5 @@ class TestCommand:
         assert "Außentemperatur 温度" in text
         for kind in ([], ["--class"]):
             made = tmp_path / f"made{len(kind)}"
-            assert cli("new", path, *kind, "--output", made)[0] == 0
+            ran("new", path, *kind, "--output", made)
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")

@@ -93,7 +93,7 @@ SCENARIOS = TASK | {
 }
 
 
-def test_a_scenario_is_an_environment(tmp_path, cli):
+def test_a_scenario_is_an_environment(tmp_path, refused, ran):
     Task.from_dict(SCENARIOS).write(tmp_path / "task.toml")
     path = str(tmp_path / "task.toml")
     env = gymnasium.make("fmugym/FMU-v0", config=path, scenario="peak").unwrapped
@@ -104,12 +104,8 @@ def test_a_scenario_is_an_environment(tmp_path, cli):
     envs = gymnasium.make_vec("fmugym/FMU-v0", num_envs=2, config=path, scenario="mild")
     assert envs.reset(seed=0)[0][:, 0].tolist() == [0, 0]
     envs.close()
-    code, out, _ = cli("simulate", path, "--scenario", "peak")
-    assert code == 0
-    assert "reward 56 in 4 steps" in out
-    code, _, err = cli("simulate", path, "--scenario", "peek")
-    assert code == 1
-    assert "'peak'" in err
+    assert "reward 56 in 4 steps" in ran("simulate", path, "--scenario", "peak")
+    assert "'peak'" in refused("simulate", path, "--scenario", "peek")
 
 
 @pytest.mark.parametrize(

@@ -261,17 +261,16 @@ def test_a_task_file_names_elements(state_space, tmp_path):
 
 
 @pytest.mark.parametrize("words", [(), ("--class",)], ids=["task", "class"])
-def test_fmugym_new_knows_elements(state_space, tmp_path, words, cli):
+def test_fmugym_new_knows_elements(state_space, tmp_path, words, ran):
     path = tmp_path / ("new.py" if words else "new.toml")
-    assert cli("new", state_space, "--output", path, *words)[0] == 0
+    ran("new", state_space, "--output", path, *words)
     text = path.read_text()
     for name in ("u[1]", "y[1]", "y[2]", "y[3]", "x[1]", "x[2]"):
         assert f'"{name}"' in text
     assert "[[-1.0, 0.5], [0.0, -2.0]]" in text
     if not words:
         path.write_text(text.replace("# A = [[-1.0, 0.5]", "A = [[-1.0, 0.25]"))
-        code, out, _ = cli("validate", path)
-        assert code == 0
+        out = ran("validate", path)
         assert "each parameter of the task has an effect" in out
         env = fmugym.load(path)
         env.reset()

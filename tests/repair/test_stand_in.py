@@ -93,15 +93,14 @@ def compiler(request, monkeypatch):
     },
     indirect=["fmu_path", "compiler"],
 )
-def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, cli):
+def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, ran):
     (name,) = stand_in.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
     (command,) = re.findall(
         r"^fmugym (info --repair model.fmu .* lib)$", DOCUMENT.read_text(), re.MULTILINE
     )
     replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
-    code, said, _ = cli(*[replaced.get(word, word) for word in command.split()])
-    assert code == 0
+    said = ran(*[replaced.get(word, word) for word in command.split()])
     assert "without _gfortran_matmul_r8" in said
     preload = [str(tmp_path / name)]
     assert f'"foreign": {{"preload": {json.dumps(preload)}}}' in said
@@ -121,10 +120,9 @@ def test_what_the_stand_in_lacks_ends_the_trial_with_its_name(fmu_path, tmp_path
     assert "has no function _gfortran_matmul_r8, which the FMU calls" in said
 
 
-def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, cli):
+def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, cli, ran):
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))  # nobody has met it
-    code, out, _ = cli("info", fmu_path)
-    assert code == 0
+    out = ran("info", fmu_path)
     (name,) = FMU(fmu_path).missing_libraries
     assert (
         f"does NOT run here: Probe.fmu needs shared libraries that are not found here: {name}"
@@ -132,9 +130,7 @@ def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, c
     )
     assert "'fmugym info --repair FMU' makes a replacement" in out
     assert "runs here\n" not in out
-    code, out, _ = cli("info", fmu_path, "--json")
-    assert code == 0
-    facts = json.loads(out)
+    facts = json.loads(ran("info", fmu_path, "--json"))
     assert facts["runs_here"] is False
     assert [row["name"] for row in facts["missing_libraries"]] == [name]
     code, _, err = cli("new", "--class", fmu_path)
@@ -142,26 +138,25 @@ def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, c
     assert "does not run on this machine: Probe.fmu needs shared libraries" in err
 
 
-def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatch, cli):
+def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatch, ran):
     """From the FMU to an episode: ``new`` names the library, once it is there in earnest."""
     (name,) = FMU(fmu_path).missing_libraries
     task = tmp_path / "task.toml"
-    assert cli("new", fmu_path, "--output", task)[0] == 0
+    ran("new", fmu_path, "--output", task)
     assert (
         f"\n[foreign]\n# The FMU needs this: fmugym info --repair {fmu_path.name}"
         in task.read_text()
     )
     assert f'\n# preload = ["./{name}"]' in task.read_text()
-    assert cli("info", "--repair", fmu_path, "--output", tmp_path)[0] == 0
+    ran("info", "--repair", fmu_path, "--output", tmp_path)
     task.unlink()
-    assert cli("new", fmu_path, "--output", task)[0] == 0
+    ran("new", fmu_path, "--output", task)
     assert f'\npreload = ["./{name}"]' in task.read_text()
     monkeypatch.setenv("FMUGYM_PROBE", "on")
     # not in this process, which may have loaded another library of that name
     played = run_python("-m", "fmugym", "simulate", task, "--steps", 2)
     assert played.returncode == 0, played.stderr
-    code, said, _ = cli("info", task)
-    assert code == 0
+    said = ran("info", task)
     assert "linux64: runs here" in said
     assert "reset is right" in said
     Task.read(task).write(tmp_path / "copy.toml")
@@ -170,37 +165,34 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
     ]
 
 
-def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, cli):
+def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, ran):
     (name,) = FMU(fmu_path).missing_libraries
     (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
     assert play(fmu_path, preload=[str(built.path)]) == STEPPED
-    code, said, _ = cli("info", fmu_path)
-    assert code == 0
+    said = ran("info", fmu_path)
     assert "restore is right" in said
     assert "does NOT run here" not in said
     assert "has run here, but not like this: Probe.fmu needs" in said
     assert name in said
 
 
-def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(fmu_path, probe, tmp_path, cli):
+def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(
+    fmu_path, probe, tmp_path, refused
+):
     with pytest.raises(ConfigError, match=r"Probe.fmu lacks neither libgfortran.so.3 nor"):
         stand_in.build_stand_in(FMU(probe()), tmp_path)
     (name,) = FMU(fmu_path).missing_libraries
     (tmp_path / name).write_text("precious")
-    code, _, err = cli("info", "--repair", fmu_path, "--output", tmp_path)
-    assert code == 1
-    assert "exists already" in err
+    assert "exists already" in refused("info", "--repair", fmu_path, "--output", tmp_path)
     assert (tmp_path / name).read_text() == "precious"
 
 
-def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, cli):
+def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, ran):
     """By default to the working directory; the path in ``preload`` holds elsewhere, too."""
     (name,) = FMU(fmu_path).missing_libraries
     monkeypatch.chdir(tmp_path)
-    code, out, _ = cli("info", "--repair", fmu_path)
-    assert code == 0
-    assert f'preload = ["{tmp_path / name}"]' in out
-    assert cli("stand-in", fmu_path, "--folder", "a/b")[0] == 0
+    assert f'preload = ["{tmp_path / name}"]' in ran("info", "--repair", fmu_path)
+    ran("stand-in", fmu_path, "--folder", "a/b")
     assert (tmp_path / "a" / "b" / name).is_file()
     with pytest.raises(ConfigError, match="cannot hold libraries"):
         stand_in.build_stand_in(FMU(fmu_path), tmp_path / name / "inside")

@@ -225,14 +225,12 @@ class TestTrial:
         assert verdict.reset_method is RESTORE
         assert verdict.components == ()
 
-    def test_info_tells_it(self, fmu_of, tmp_path, cli):
+    def test_info_tells_it(self, fmu_of, tmp_path, ran):
         system = chain(fmu_of, "well behaved", "reset does nothing")
         archive = ssp_tools.write(system, tmp_path / "chain.ssp")
         system = FMUSystem.read(archive)
         verdict_of(system)
-        code, out, _ = cli("info", archive)
-        assert code == 0
-        lines = out.splitlines()
+        lines = ran("info", archive).splitlines()
         (one,) = (line for line in lines if line.strip().startswith("a:"))
         (other,) = (line for line in lines if line.strip().startswith("b:"))
         assert "'restore'" in one

@@ -82,9 +82,8 @@ class TestWithoutWine:
         with pytest.raises(FMULoadError, match=r"wine64.*\[windows\]"):
             open_pool(cart_pole)
 
-    def test_info_says_how_to_get_there(self, cart_pole, bare, cli):
-        code, out, _ = cli("info", cart_pole)
-        assert code == 0
+    def test_info_says_how_to_get_there(self, cart_pole, bare, ran):
+        out = ran("info", cart_pole)
         line, *_ = (r for r in out.splitlines() if "this machine" in r)
         assert "does NOT run here" in line
         assert "wine64" in line
@@ -382,10 +381,8 @@ class TestInWine:
             processes.add(pool.processes()[0])
         assert 1 < len(processes) < 10
 
-    def test_info_says_that_it_runs_in_wine(self, cart_pole, cli):
-        code, out, _ = cli("info", cart_pole)
-        assert code == 0
-        assert "win64: runs here, in Wine" in out
+    def test_info_says_that_it_runs_in_wine(self, cart_pole, ran):
+        assert "win64: runs here, in Wine" in ran("info", cart_pole)
 
     def test_a_path_with_blanks_and_umlauts(self, tmp_path, opened):
         folder = tmp_path / "a folder, ü"
