@@ -212,7 +212,7 @@ class TestCommand:
         assert len(list((folder / "old").iterdir())) == 1
 
 
-def test_the_record_of_a_shadow(folder, monkeypatch, cli, refused):
+def test_the_record_of_a_shadow(folder, monkeypatch, ran, refused):
     """With a gap, on the plant's time, and with the data that the record has."""
     pytest.importorskip("pymodbus", reason="needs pymodbus: the extra plant")
     from plant_tools import LockStep, changed, house, nothing_left, watched
@@ -237,9 +237,7 @@ def test_the_record_of_a_shadow(folder, monkeypatch, cli, refused):
             env.step(np.float32([0.5]))
         env.complete()
     command = ["simulate", folder / "house.toml", "--output", "minari:test/shadow-v0"]
-    code, out, err = cli(*command, "--log", folder / "shadow.csv")
-    assert code == 0, err
-    assert "2 episodes, 6 steps" in out
+    assert "2 episodes, 6 steps" in ran(*command, "--log", folder / "shadow.csv")
     names = list(env.unwrapped.observation_names)
     for begin, episode in zip((0, 7), minari.load_dataset("test/shadow-v0"), strict=True):
         rows = range(begin, begin + len(episode) + 1)

@@ -61,11 +61,10 @@ class TestRecord:
         assert page.count("<figure>") == 2
         assert "<h2>action 10</h2>" in page
 
-    def test_parquet(self, tmp_path, cli):
+    def test_parquet(self, tmp_path, ran):
         pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
         path = tmp_path / "a.parquet"
-        code, *_ = cli("simulate", CART_POLE, "--output", path)
-        assert code == 0
+        ran("simulate", CART_POLE, "--output", path)
         assert TimeSeries.read(path)["reward"].sum() == len(TimeSeries.read(path)) - 1
 
     @pytest.mark.parametrize("error", [KeyboardInterrupt, fmugym.SimulationError])
@@ -172,7 +171,7 @@ class TestBench:
 
 class TestProgress:
     @pytest.mark.parametrize("is_terminal", [False, True])
-    def test_bars_are_for_terminals(self, is_terminal, cli, monkeypatch):
+    def test_bars_are_for_terminals(self, is_terminal, ran, monkeypatch):
         bars = []
 
         class Bar:
@@ -191,8 +190,7 @@ class TestProgress:
         monkeypatch.setitem(sys.modules, "tqdm", SimpleNamespace(tqdm=Bar))
         monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
         options = "--steps", "3", "--episodes", "2"
-        code, *_ = cli("simulate", "fmugym/House-v0", *options)
-        assert code == 0
+        ran("simulate", "fmugym/House-v0", *options)
         assert bars == ([(6, [1] * 6)] if is_terminal else [])
 
     def test_without_tqdm_there_are_none(self, cli, monkeypatch):

@@ -14,44 +14,41 @@ from fmugym.archive.bundled import MODELS
 make_fmu = test_cli.make_fmu
 
 
-def proposed(cli, fmu):
+def proposed(ran, fmu):
     """The task and the notes."""
-    code, out, _ = cli("new", fmu, "--json")
-    assert code == 0
-    told = json.loads(out)
+    told = json.loads(ran("new", fmu, "--json"))
     return told["task"], "\n".join(told["notes"])
 
 
 @pytest.fixture
-def new(cli):
-    return lambda fmu: proposed(cli, fmu)
+def new(ran):
+    return lambda fmu: proposed(ran, fmu)
 
 
-def trained(folder, cli, fmu):
+def trained(folder, ran, fmu):
     """The facts of the agent that a newcomer gets by two commands."""
     path, agent = folder / "task.toml", folder / "agent"
-    assert cli("new", fmu, "--output", path)[0] == 0
+    ran("new", fmu, "--output", path)
     options = "--rounds", "30", "--episodes", "2"
-    code, _, err = cli("train", path, "--output", agent, *options)
-    assert code == 0, err
+    ran("train", path, "--output", agent, *options)
     return json.loads((agent / "agent.json").read_text())
 
 
 @pytest.mark.parametrize("maker", MADE)
-def test_foreign_fmus_train_without_editing(maker, tmp_path, cli):
+def test_foreign_fmus_train_without_editing(maker, tmp_path, ran):
     (tmp_path / "made").mkdir()
-    facts = trained(tmp_path, cli, MADE[maker].build(tmp_path / "made"))
+    facts = trained(tmp_path, ran, MADE[maker].build(tmp_path / "made"))
     assert facts["rounds"] == 30
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_types_of_every_kind_train_without_editing(version, tmp_path, cli):
-    assert trained(tmp_path, cli, probe_fmu(tmp_path, version))["rounds"] == 30
+def test_types_of_every_kind_train_without_editing(version, tmp_path, ran):
+    assert trained(tmp_path, ran, probe_fmu(tmp_path, version))["rounds"] == 30
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_bundled_fmus_train_without_editing(model, tmp_path, cli):
-    assert trained(tmp_path, cli, fmugym.bundled_fmu(model))["rounds"] == 30
+def test_bundled_fmus_train_without_editing(model, tmp_path, ran):
+    assert trained(tmp_path, ran, fmugym.bundled_fmu(model))["rounds"] == 30
 
 
 def test_weather_and_people_are_no_actions(new):

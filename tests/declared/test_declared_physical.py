@@ -195,10 +195,8 @@ OWN = {"half": 0.5, "own": "pid of=T setpoint=21 kp=1"}
 
 
 class TestCommandLine:
-    def found(self, cli, *arguments):
-        code, out, _ = cli(*arguments, "--steps", "48", "--json")
-        assert code == 0
-        return json.loads(out)
+    def found(self, ran, *arguments):
+        return json.loads(ran(*arguments, "--steps", "48", "--json"))
 
     def files(self, kind, tmp_path):
         """The task, and the same with a form for agents."""
@@ -208,17 +206,17 @@ class TestCommandLine:
             yield path
 
     @pytest.mark.parametrize("kind", ["levels", "delta"])
-    def test_all_who_are_no_agents_play_as_without_its_form(self, kind, tmp_path, cli):
+    def test_all_who_are_no_agents_play_as_without_its_form(self, kind, tmp_path, ran):
         pid = "--controller", "own"
         players = *pid, "--controller", "half", "--action", "0.4", "--episodes", "1"
         search = "pid of=T setpoint=20..22 kp=1", "--rounds", "1", "--candidates", "8"
         results = []
         for path in self.files(kind, tmp_path):
             table = tmp_path / f"{path.stem}.csv"
-            one = self.found(cli, "simulate", path, *pid)["episodes"]
-            two = self.found(cli, "simulate", path, *pid, "--output", table, "--variables", "u")
-            three = self.found(cli, "tune", path, *search, "--episodes", "1")
-            _, *scores = self.found(cli, "evaluate", path, *players)["scores"]
+            one = self.found(ran, "simulate", path, *pid)["episodes"]
+            two = self.found(ran, "simulate", path, *pid, "--output", table, "--variables", "u")
+            three = self.found(ran, "tune", path, *search, "--episodes", "1")
+            _, *scores = self.found(ran, "evaluate", path, *players)["scores"]
             four = [(score["name"], score["rewards"]) for score in scores]
             results.append((one, two["runs"], three["rewards_of_rounds"], table.read_text(), four))
         assert results[0] == results[1]
