@@ -140,6 +140,30 @@ def cli(capsys):
 
 
 @pytest.fixture
+def ran(cli):
+    """Call the command line, which must succeed; what it printed to standard output."""
+
+    def call(*arguments):
+        code, out, err = cli(*arguments)
+        assert code == 0, err
+        return out
+
+    return call
+
+
+@pytest.fixture
+def refused(cli):
+    """Call the command line, which must fail; what it printed to the error stream."""
+
+    def call(*arguments):
+        code, _, err = cli(*arguments)
+        assert code == 1
+        return err
+
+    return call
+
+
+@pytest.fixture
 def temp_root(tmp_path, monkeypatch):
     """An empty folder in which all temporary folders are made."""
     root = tmp_path / "temporary"

@@ -1,10 +1,9 @@
 """What ``import fmugym`` imports, and the names that come later."""
 
 import pkgutil
-import subprocess
-import sys
 
 import pytest
+from process_tools import run_python
 
 import fmugym
 from fmugym import vector
@@ -19,10 +18,7 @@ OPTIONAL = (
 
 def run(program):
     """The output of a program in a new interpreter, as words."""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
-    )
-    return done.stdout.split()
+    return run_python("-c", program, check=True).stdout.split()
 
 
 def test_importing_the_package_imports_little():
@@ -106,6 +102,6 @@ def test_other_names_are_refused(module):
 )
 def test_a_missing_library_names_its_extra(module, library):
     program = f"import sys; sys.modules[{library!r}] = None; import fmugym.{module}"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    done = run_python("-c", program)
     assert done.returncode == 1
     assert f"pip install '.[{module}]'" in done.stderr

@@ -8,7 +8,6 @@ import pytest
 
 import fmugym
 from fmugym.config import EnvConfig
-from fmugym.tools.cli import main
 
 ROOT = Path(__file__).parent.parent
 
@@ -41,10 +40,10 @@ def test_one_error_tells_all_mistakes_of_a_config():
         assert fact in str(caught.value)
 
 
-def test_a_new_task_names_the_schema_beside_it(tmp_path, monkeypatch):
+def test_a_new_task_names_the_schema_beside_it(tmp_path, monkeypatch, ran):
     shutil.copy(fmugym.bundled_fmu("Pendulum"), tmp_path / "model.fmu")
     monkeypatch.chdir(tmp_path)
-    assert main(["new", "model.fmu", "--output", "task.toml"]) == 0
+    ran("new", "model.fmu", "--output", "task.toml")
     first, *_ = Path("task.toml").read_text().splitlines()
     schema = Path(first.removeprefix("#:schema "))
     assert not schema.is_absolute()

@@ -11,7 +11,6 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.recording import Recorder, Recording, replay
 from fmugym.series import RecordSeries
-from fmugym.tools.cli import main
 
 minari = pytest.importorskip("minari", reason="needs Minari: the extra minari")
 
@@ -156,33 +155,31 @@ class TestMistakes:
 
 
 class TestCommand:
-    def test_episodes_of_a_controller(self, capsys):
+    def test_episodes_of_a_controller(self, ran):
         command = ["simulate", "fmugym/Pendulum-v0", "--output", "minari:test/random-v0"]
-        assert main([*command, "--episodes", "2", "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
+        told = json.loads(ran(*command, "--episodes", "2", "--json"))
         assert (told["episodes"], told["steps"]) == (2, 400)
         recordings = read_dataset("test/random-v0")
         assert [bool(one.truncated[-1]) for one in recordings] == [True, True]
 
-    def test_back_to_recordings(self, folder, capsys):
+    def test_back_to_recordings(self, folder, ran):
         command = ["simulate", "fmugym/CartPole-v0", "--output", "minari:test/two-v0"]
-        assert main([*command, "--episodes", "2"]) == 0
-        assert main(["info", "minari:test/two-v0", "--output", str(folder / "out")]) == 0
+        ran(*command, "--episodes", "2")
+        ran("info", "minari:test/two-v0", "--output", folder / "out")
         files = sorted((folder / "out").iterdir())
         assert len(files) == 2
         texts = [argument for file in files for argument in ("--log", str(file))]
         again = ["simulate", "fmugym/CartPole-v0", "--output", "minari:test/again-v0", *texts]
-        assert main(again) == 0
+        ran(*again)
         assert len(Recording.load(files[0])) == len(read_dataset("test/again-v0")[0])
 
-    def test_logs(self, folder, capsys):
+    def test_logs(self, folder, ran):
         with RecordSeries(gym.make("fmugym/House-v0"), path=folder / "week.csv") as env:
             env.reset(seed=0)
             for _ in range(20):
                 env.step(env.action_space.sample())
         command = ["simulate", "fmugym/House-v0", "--output", "minari:test/log-v0", "--log"]
-        assert main([*command, str(folder / "week.csv")]) == 0
-        assert "1 episodes, 20 steps" in capsys.readouterr().out
+        assert "1 episodes, 20 steps" in ran(*command, folder / "week.csv")
 
     @pytest.mark.parametrize(
         ("arguments", "fact"),
@@ -192,30 +189,30 @@ class TestCommand:
             (["--output", "more.csv"], "alone"),
         ],
     )
-    def test_mistakes(self, arguments, fact, capsys):
+    def test_mistakes(self, arguments, fact, refused):
         name = "minari:test/wrong-v0"
-        assert main(["simulate", "fmugym/CartPole-v0", "--output", name, *arguments]) == 1
-        assert fact in capsys.readouterr().err
+        assert fact in refused("simulate", "fmugym/CartPole-v0", "--output", name, *arguments)
 
-    def test_a_dataset_is_replaced_only_by_force(self, capsys):
+    def test_a_dataset_is_replaced_only_by_force(self, refused, ran):
         command = ["simulate", "fmugym/CartPole-v0", "--output", "minari:test/once-v0"]
-        assert main([*command, "--episodes", "1"]) == 0
-        assert main([*command, "--episodes", "2"]) == 1
-        assert "test/once-v0" in capsys.readouterr().err
+        ran(*command, "--episodes", "1")
+        assert "test/once-v0" in refused(*command, "--episodes", "2")
         assert len(read_dataset("test/once-v0")) == 1
-        assert main([*command, "--episodes", "2", "--force"]) == 0
+        ran(*command, "--episodes", "2", "--force")
         assert len(read_dataset("test/once-v0")) == 2
 
-    def test_the_old_name_of_the_command_warns(self, folder, capsys):
+    def test_the_old_name_of_the_command_warns(self, folder, cli):
         command = ["dataset", "test/old-v0", "--task", "fmugym/CartPole-v0", "--episodes", "1"]
-        assert main(command) == 0
-        assert "fmugym simulate fmugym/CartPole-v0" in capsys.readouterr().err
-        assert main(["dataset", "test/old-v0", "--output", str(folder / "old")]) == 0
-        assert "fmugym info minari:test/old-v0" in capsys.readouterr().err
+        code, _, err = cli(*command)
+        assert code == 0
+        assert "fmugym simulate fmugym/CartPole-v0" in err
+        code, _, err = cli("dataset", "test/old-v0", "--output", folder / "old")
+        assert code == 0
+        assert "fmugym info minari:test/old-v0" in err
         assert len(list((folder / "old").iterdir())) == 1
 
 
-def test_the_record_of_a_shadow(folder, monkeypatch, capsys):
+def test_the_record_of_a_shadow(folder, monkeypatch, ran, refused):
     """With a gap, on the plant's time, and with the data that the record has."""
     pytest.importorskip("pymodbus", reason="needs pymodbus: the extra plant")
     from plant_tools import LockStep, changed, house, nothing_left, watched
@@ -239,9 +236,8 @@ def test_the_record_of_a_shadow(folder, monkeypatch, capsys):
             gone[:] = [True] * (step in (4, 5))
             env.step(np.float32([0.5]))
         env.complete()
-    command = ["simulate", str(folder / "house.toml"), "--output", "minari:test/shadow-v0"]
-    assert main([*command, "--log", str(folder / "shadow.csv")]) == 0, capsys.readouterr().err
-    assert "2 episodes, 6 steps" in capsys.readouterr().out
+    command = ["simulate", folder / "house.toml", "--output", "minari:test/shadow-v0"]
+    assert "2 episodes, 6 steps" in ran(*command, "--log", folder / "shadow.csv")
     names = list(env.unwrapped.observation_names)
     for begin, episode in zip((0, 7), minari.load_dataset("test/shadow-v0"), strict=True):
         rows = range(begin, begin + len(episode) + 1)
@@ -250,5 +246,5 @@ def test_the_record_of_a_shadow(folder, monkeypatch, capsys):
         np.testing.assert_allclose(episode.rewards, env.series["reward"][rows[1:]], atol=1e-6)
         np.testing.assert_allclose(episode.actions.ravel(), env.series["u"][rows[1:]], atol=1e-6)
     assert [bool(one.truncated[-1]) for one in read_dataset("test/shadow-v0")] == [True, True]
-    assert main([*command, "--log", str(folder / "shadow.csv"), "--scenario", "frost"]) == 1
-    assert "shadow.csv' has its own periods" in capsys.readouterr().err
+    err = refused(*command, "--log", folder / "shadow.csv", "--scenario", "frost")
+    assert "shadow.csv' has its own periods" in err

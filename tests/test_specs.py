@@ -1,16 +1,13 @@
 """Specs of registered environments: as text, pickled, and in another program."""
 
 import json
-import os
 import pickle
-import subprocess
-import sys
 
-import building
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
+from process_tools import run_python
 
 import fmugym
 from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform
@@ -106,14 +103,7 @@ print(env.unwrapped.state[0] > 0.0)
 
 def load_elsewhere(text):
     """Make an environment of a spec in a program that has not imported fmugym."""
-    return subprocess.run(
-        [sys.executable, "-c", LOAD],
-        input=text,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": building.PATH},
-        check=False,
-    )
+    return run_python("-c", LOAD, input=text)
 
 
 def test_a_spec_in_another_program(swing_id):
@@ -157,9 +147,7 @@ def test_a_class_of_a_script(tmp_path):
     """Its own processes find it; another program does not, and is told the name of the class."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, check=False
-    )
+    done = run_python(script)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["entry_point"] == "__main__:Swing"
     elsewhere = load_elsewhere(done.stdout)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import tomllib
 from pathlib import Path
@@ -105,7 +104,10 @@ def _info(arguments: argparse.Namespace) -> None:
         facts, as_lines = overview(model, **wanted), as_text
     else:
         raise ConfigError("--plot is for systems; an FMU alone has no connections to draw")
-    say(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else as_lines(facts))
+    if arguments.json:
+        say_json(facts)
+    else:
+        say(as_lines(facts))
 
 
 def _repair(arguments: argparse.Namespace, fmu: FMU) -> None:

@@ -21,9 +21,6 @@ from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "finite_or_none", "headed", "overview", "start_value", "tables"]
 
-SCHEMA: Final = 1
-"""Raised when a key goes or changes its meaning; new keys do not raise it."""
-
 SHOWN: Final = ("input", "output", "parameter")
 """The causalities that are listed by default."""
 
@@ -57,7 +54,6 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
     description = fmu.description
     variables = description.variables.values()
     return {
-        "schema": SCHEMA,
         "path": str(fmu.path),
         **{name: getattr(description, name) for name in _TEXTS},
         "interfaces": list(description.interfaces),

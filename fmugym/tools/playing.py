@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -212,7 +213,7 @@ def _bench(arguments: argparse.Namespace) -> None:
 
     def show() -> None:
         for last in reports[-1:]:  # which has the speeds of those before
-            say_result(arguments, last.as_dict(), speed_table(last))
+            say_result(arguments, asdict(last), speed_table(last))
 
     with shown_in_any_case(show):
         make = maker_of(arguments.task, master=arguments.master, takes_fmu=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Final
 
@@ -63,10 +63,6 @@ class Report:
     time_step: float
     processors: int
     load: float | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """The numbers in types that JSON has."""
-        return asdict(self)
 
 
 def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) -> Iterator[Report]:

@@ -95,7 +95,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         findings = [*_findings(env, first)]
         costs = {
             "step": first.step_time,
-            "reset": _play(env, None).reset_time,
+            "reset": _play(env, env.action_space.sample, most_steps=0).reset_time,
             "restore": _restore_time(env),
         }
         hooks = _hooks(make_env)
@@ -175,7 +175,7 @@ def _recommended(
 
 def _play(
     env: FMUEnv,
-    choose: Callable[[], Any] | None,
+    choose: Callable[[], Any],
     options: Mapping[str, Any] | None = None,
     most_steps: int = _MOST_STEPS,
     seed: int = 0,
@@ -187,7 +187,7 @@ def _play(
     observations: list[Any] = [_flat(observation)]
     rewards: list[float] = []
     fault, terminated = None, False
-    while choose is not None and len(rewards) < most_steps:
+    while len(rewards) < most_steps:
         observation, reward, terminated, truncated, info = env.step(choose())
         observations.append(_flat(observation))
         rewards.append(reward)

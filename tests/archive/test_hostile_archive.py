@@ -24,7 +24,6 @@ from fmu_tools import (
 
 from fmugym import FMU, FMULoadError, SimulationError
 from fmugym.errors import printable
-from fmugym.tools.cli import main
 
 XML = "modelDescription.xml"
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
@@ -214,16 +213,14 @@ class TestControlCharacters:
         assert not any(CONTROL.search(message) for message in caplog.messages)
 
     @pytest.mark.parametrize("options", [[], ["--all"], ["--json"]])
-    def test_command_line(self, tmp_path, capsys, options):
+    def test_command_line(self, tmp_path, options, ran):
         edits = {'modelName="Probe"': f'modelName="{EVIL}"', 'name="sum"': f'name="{EVIL}"'}
         path = probe_fmu(tmp_path, 2, edits, add={f"resources/{EVIL}": ""})
-        assert main(["info", str(path), *options]) == 0
-        out = capsys.readouterr().out
+        out = ran("info", path, *options)
         assert not CONTROL.search(out)
         if options == ["--json"]:
             assert json.loads(out)["model_name"] == EVIL
 
-    def test_command_line_errors(self, tmp_path, capsys):
+    def test_command_line_errors(self, tmp_path, refused):
         path = edited_fmu(probe_fmu(tmp_path), tmp_path, add={f"../{EVIL}\x1b": ""})
-        assert main(["info", str(path)]) == 1
-        assert not CONTROL.search(capsys.readouterr().err)
+        assert not CONTROL.search(refused("info", path))

@@ -19,7 +19,6 @@ from fmu_tools import (
 )
 
 from fmugym import FMU
-from fmugym.tools.cli import main
 
 XML = "modelDescription.xml"
 SUFFIX = fmpy.sharedLibraryExtension
@@ -188,14 +187,13 @@ class TestLibraries:
         return pack_named
 
     @in_turn({"name": ["Other", "probe", "lib Probe-1.0"], "version": [2, 3]})
-    def test_of_another_name(self, named, capsys, caplog, version, name):
+    def test_of_another_name(self, named, caplog, version, name, ran):
         path, other = named(name, version), library_name(version, name)
         with caplog.at_level("INFO", "fmugym"):
             runs(path)
         assert other in caplog.text
         assert f"the library is {other!r}, expected {library_name(version)!r}" in findings(path)
-        assert main(["info", str(path)]) == 0
-        out = capsys.readouterr().out
+        out = ran("info", path)
         assert other in out
         assert ": runs here" in out
 

@@ -17,7 +17,6 @@ from fmugym.baselines.observer import spread
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.task.future import Future, Lookup
-from fmugym.tools.cli import main
 
 CALM = np.zeros(24)
 
@@ -426,13 +425,7 @@ class TestRefusals:
 
 class TestCommandLine:
     @pytest.fixture
-    def path(self, tmp_path):
-        path = tmp_path / "wheel.toml"
-        fmugym.Task.of(wheel(controllers={"ahead": "mpc horizon=1h candidates=64"})).write(path)
-        return str(path)
-
-    @pytest.fixture
-    def everyone(self, tmp_path, capsys, monkeypatch):
+    def everyone(self, tmp_path, monkeypatch, ran):
         """Who is compared, and the options for it; starts are drawn."""
         start = {"distribution": "uniform", "low": -0.5, "high": 0.5}
         ahead = "mpc horizon=1h candidates=64"
@@ -441,19 +434,17 @@ class TestCommandLine:
         monkeypatch.chdir(tmp_path)
         fmugym.Task.of(task).write(tmp_path / "drawn.toml")
         trained = ["--output", "agent", "--rounds", "9", "--episodes", "1"]
-        assert main(["train", "drawn.toml", *trained]) == 0
-        capsys.readouterr()
+        ran("train", "drawn.toml", *trained)
         names = ["pi", "ahead", f"{ahead} perfect=true"]
         asked = [word for name in names for word in ("--controller", name)]
         played = ["--agent", "agent", "--steps", "8", "--episodes", "3"]
         return [*names, "agent"], ["drawn.toml", *asked, *played]
 
-    def test_compares_it_with_others(self, everyone, tmp_path, capsys):
+    def test_compares_it_with_others(self, everyone, tmp_path, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         names, options = everyone
         picture = tmp_path / "scores.svg"
-        assert main(["evaluate", *options, "--plot", str(picture), "--json"]) == 0
-        scores = json.loads(capsys.readouterr().out)["scores"]
+        scores = json.loads(ran("evaluate", *options, "--plot", picture, "--json"))["scores"]
         pid, ahead, perfect, agent = (next(s for s in scores if s["name"] == n) for n in names)
         assert pid["gains"] == []
         for one in (ahead, perfect, agent):
@@ -467,11 +458,11 @@ class TestCommandLine:
         assert "gain beside" in "".join(drawn)
         assert [text for text in drawn if text in names] == [*names, names[0]]
 
-    def test_a_report_shows_it_beside_others(self, everyone, tmp_path):
+    def test_a_report_shows_it_beside_others(self, everyone, tmp_path, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         names, options = everyone
         page = tmp_path / "report.html"
-        assert main(["simulate", *options, "--output", str(page)]) == 0
+        ran("simulate", *options, "--output", page)
         means = page.read_text().split("<table>")[1].replace("\u2212", "-")
         head, *rows = (re.findall("<t[dh].*?>(.*?)</t", row) for row in means.split("<tr>")[1:])
         assert head == ["", "episodes", "reward", "± (95 %)", "gain", "± (95 %)"]
@@ -482,15 +473,15 @@ class TestCommandLine:
             assert float(row[4]) == pytest.approx(gain, abs=2e-3)
             assert 0 < float(row[5]) < 0.5 * float(row[3])
 
-    def test_thinking_ahead_costs_least_in_a_house(self, capsys):
+    def test_thinking_ahead_costs_least_in_a_house(self, ran):
         pid, ahead = "pid of=T setpoint=21 kp=1.3 ti=2000", "mpc horizon=24h candidates=64"
         asked = [word for name in (pid, ahead) for word in ("--controller", name)]
         played = ["--scenario", "frost", "--steps", "192", "--episodes", "1", "--json"]
-        assert main(["evaluate", "fmugym/House-v0", *asked, *played]) == 0
-        _, tuned, planned = json.loads(capsys.readouterr().out)["scores"]
+        out = ran("evaluate", "fmugym/House-v0", *asked, *played)
+        _, tuned, planned = json.loads(out)["scores"]
         assert planned["mean_reward"] > 0.98 * tuned["mean_reward"]
 
-    def test_training_compares_it_where_there_is_time(self, tmp_path, capsys):
+    def test_training_compares_it_where_there_is_time(self, tmp_path, cli):
         given = {
             "pi": "pid of=q_dot setpoint=1 kp=0.1..4",
             "ahead": "mpc horizon=1h candidates=64",
@@ -499,17 +490,17 @@ class TestCommandLine:
         path = tmp_path / "wheel.toml"
         fmugym.Task.of(wheel(controllers=given)).write(path)
         options = ["--output", str(tmp_path / "agent"), "--rounds", "9", "--envs", "8"]
-        assert main(["train", str(path), *options, "--episodes", "2", "--json"]) == 0
-        told = capsys.readouterr()
-        found = json.loads(told.out)
+        code, out, err = cli("train", path, *options, "--episodes", "2", "--json")
+        assert code == 0
+        found = json.loads(out)
         test, baseline = found["test"], found["baseline"]
         assert test["ahead"]["total_reward"] > test[baseline]["total_reward"] - 0.01
         assert "slow" not in test
-        assert "left out: slow, whose test would take about" in told.err
+        assert "left out: slow, whose test would take about" in err
 
-    def test_its_numbers_are_not_tuned(self, path, capsys):
-        assert main(["tune", path, "mpc horizon=3600..7200"]) == 1
-        assert "'mpc' cannot be tuned; known are: hysteresis, pid" in capsys.readouterr().err
+    def test_its_numbers_are_not_tuned(self, refused):
+        err = refused("tune", "fmugym/Pendulum-v0", "mpc horizon=3600..7200")
+        assert "'mpc' cannot be tuned; known are: hysteresis, pid" in err
 
     def test_it_does_not_act_in_a_warm_up(self, env_of):
         table = {"period": "1h", "controller": "mpc horizon=1h"}

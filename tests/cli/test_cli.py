@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import re
 import shlex
 import subprocess
@@ -18,6 +17,7 @@ import quirk_table
 import zoo_tools
 from fmu_tools import HERE, library_name, probe_fmu, read_fmu
 from plants import ONCE
+from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
@@ -35,8 +35,7 @@ XML = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def run(*arguments, **options):
-    command = [sys.executable, "-m", "fmugym", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+    return run_python("-m", "fmugym", *arguments, **options)
 
 
 def variable(name, inner, causality="input", variability="continuous", **attributes):
@@ -71,12 +70,8 @@ def make_fmu(tmp_path):
 
 
 @pytest.fixture
-def info(capsys):
-    def call(path, *options):
-        assert main(["info", str(path), *options]) == 0
-        return capsys.readouterr().out
-
-    return call
+def info(ran):
+    return lambda path, *options: ran("info", path, *options)
 
 
 @pytest.fixture
@@ -361,9 +356,8 @@ class TestSkeleton:
         assert "no numeric input" in made.err
         assert "locals" in made.err
 
-    def test_nothing_to_observe_is_an_error(self, make_fmu, capsys):
-        assert main(["new", "--class", str(make_fmu(INPUT))]) == 1
-        assert "to observe" in capsys.readouterr().err
+    def test_nothing_to_observe_is_an_error(self, make_fmu, refused):
+        assert "to observe" in refused("new", "--class", make_fmu(INPUT))
 
     def test_runs_for_an_fmu_without_inputs_of_another_exporter(self, tmp_path):
         fmu = FmuBuilder.build_FMU(foreign_talker.__file__, tmp_path)
@@ -371,23 +365,22 @@ class TestSkeleton:
 
 
 class TestNew:
-    def test_what_it_leaves_out_is_counted(self, make_fmu, capsys):
+    def test_what_it_leaves_out_is_counted(self, make_fmu, cli):
         rows = [parameter(f"p{n}", f'<Real start="{n}"/>') for n in range(47)]
-        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
-        made = capsys.readouterr()
-        assert [f"# p{n} = {n}.0" in made.out for n in (39, 40)] == [True, False]
-        assert "# 7 more are listed by: fmugym info" in made.out
-        assert "7 parameters are left out; 'fmugym info' lists them" in made.err
+        code, out, err = cli("new", make_fmu(INPUT, OUTPUT, *rows))
+        assert code == 0
+        assert [f"# p{n} = {n}.0" in out for n in (39, 40)] == [True, False]
+        assert "# 7 more are listed by: fmugym info" in out
+        assert "7 parameters are left out; 'fmugym info' lists them" in err
 
-    def test_locals_that_look_like_results_are_listed(self, make_fmu, capsys):
+    def test_locals_that_look_like_results_are_listed(self, make_fmu, ran):
         """As comments: each is a line of [variables] once its # is gone."""
         real = '<Real unit="{}"/>'
         wanted = {"room.T[1]": "degC", "P": "W", "E.total": "kWh"}
         rows = [variable(name, real.format(unit), "local") for name, unit in wanted.items()]
         rows += [variable("room.T_start", real.format("K"), "local", "fixed")]
         rows += [variable("der(x)", real.format("m/s"), "local"), variable("n", "<Real/>", "local")]
-        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
-        text = capsys.readouterr().out
+        text = ran("new", make_fmu(INPUT, OUTPUT, *rows))
         table = text[text.index("# These locals") :].partition("\n[setpoints]")[0]
         table = re.sub(r"^# ", "", table.partition("\n")[2], flags=re.M)
         assert {row["name"] for row in tomllib.loads(table).values()} == wanted.keys()
@@ -397,8 +390,7 @@ class TestNew:
 def assert_skeleton_runs(fmu, folder, *options):
     """Write a skeleton into a folder and run it."""
     assert main(["new", "--class", str(fmu), "--output", str(folder / "made.py"), "--force"]) == 0
-    command = [sys.executable, *options, "made.py"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    done = run_python(*options, "made.py", cwd=folder, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "keeps the contract" in done.stdout
 
@@ -420,9 +412,8 @@ class TestCommand:
         assert done.stderr.startswith("fmugym: error: there is no FMU at")
         assert done.stderr.count("\n") == 1
 
-    def test_an_id_that_does_not_exist_has_one_nearest_name(self, capsys):
-        assert main(["bench", "fmugym/CartPol-v0"]) == 1
-        said = capsys.readouterr().err
+    def test_an_id_that_does_not_exist_has_one_nearest_name(self, refused):
+        said = refused("bench", "fmugym/CartPol-v0")
         assert said.count("Did you mean") == 1
         assert "'fmugym/CartPole-v0'" in said
 
@@ -444,16 +435,16 @@ class TestCommand:
             assert f"\n  {example}\n" in said
             assert example in documents
 
-    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(self, tmp_path, capsys):
+    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(
+        self, tmp_path, ran, refused
+    ):
         fmu, file = str(fmugym.bundled_fmu("Pendulum")), tmp_path / "a.toml"
         file.write_text("precious")
-        assert main(["new", fmu, "--output", str(file)]) == 1
-        assert (
-            "a.toml exists; name a new one, or replace it with --force" in capsys.readouterr().err
-        )
-        assert main(["new", fmu + "x", "--output", str(file), "--force"]) == 1
+        err = refused("new", fmu, "--output", file)
+        assert "a.toml exists; name a new one, or replace it with --force" in err
+        refused("new", fmu + "x", "--output", file, "--force")
         assert file.read_text() == "precious"
-        assert main(["new", fmu, "--output", str(file), "--force"]) == 0
+        ran("new", fmu, "--output", file, "--force")
         assert "time_step" in file.read_text()
         assert sorted(tmp_path.iterdir()) == [file, tmp_path / "fmugym.schema.json"]
 
@@ -480,19 +471,18 @@ class TestCommand:
         assert err.startswith("fmugym: error: ")
         assert set(tmp_path.iterdir()) == wrong
 
-    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, capsys):
+    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, refused):
         file = tmp_path / "run.csv"
         file.write_text("precious")
-        assert main(["simulate", "absent.toml", "--output", str(file)]) == 1
-        assert "run.csv exists" in capsys.readouterr().err
+        assert "run.csv exists" in refused("simulate", "absent.toml", "--output", file)
 
-    def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, capsys):
-        fmu = str(make_fmu(INPUT, OUTPUT))
+    def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, cli):
+        fmu = make_fmu(INPUT, OUTPUT)
         for options, notes in (([], True), (["-q"], False)):
-            assert main(["new", fmu, *options]) == 0
-            printed = capsys.readouterr()
-            assert "time_step" in printed.out
-            assert bool(printed.err) is notes
+            code, out, err = cli("new", fmu, *options)
+            assert code == 0
+            assert "time_step" in out
+            assert bool(err) is notes
 
     @pytest.mark.parametrize(("option", "told"), [("-v", "0 1 2"), ("-q", "2")])
     def test_the_log_of_this_command_only(self, option, told, capsys):
@@ -527,9 +517,8 @@ class TestCommand:
         """The program ``fmugym`` has its own folder in front, not the working directory."""
         text = "from fmugym.envs import CartPoleEnv\n\n\nclass Drive(CartPoleEnv):\n    pass\n"
         (tmp_path / "drive.py").write_text(text)
-        command = [sys.executable, "-P" if "-c" in program else "-B", *program]
-        command += ["simulate", "drive:Drive", "--steps", "3"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        command = "-P" if "-c" in program else "-B", *program, "simulate", "drive:Drive"
+        done = run_python(*command, "--steps", 3, cwd=tmp_path)
         assert "reward 3 in 3 steps" in done.stdout, done.stderr
 
     def test_version(self, capsys):
@@ -552,19 +541,17 @@ class TestCommand:
 
     def test_output_fits_the_narrowest_console(self, make_fmu):
         path = make_fmu(INPUT, OUTPUT, description="25 \u00b0C")
-        environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
         commands = [
             ["info", str(path)],
             ["info", str(path), "--json"],
             ["new", "--class", str(path)],
         ]
         program = f"from fmugym.tools.cli import main\nassert not any(map(main, {commands}))"
-        command = [sys.executable, "-c", program]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        done = run_python("-c", program, environment={"PYTHONIOENCODING": "ascii:strict"})
         assert done.returncode == 0, done.stderr
         assert r"25 \xb0C" in done.stdout
 
-    def test_letters_of_other_languages_stay(self, info, make_fmu, tmp_path):
+    def test_letters_of_other_languages_stay(self, info, make_fmu, tmp_path, ran):
         described = variable("u", '<Real start="0"/>', description="Außentemperatur 温度")
         path = make_fmu(described, OUTPUT).rename(tmp_path / "Übung größer.fmu")
         text = info(path)
@@ -572,5 +559,5 @@ class TestCommand:
         assert "Außentemperatur 温度" in text
         for kind in ([], ["--class"]):
             made = tmp_path / f"made{len(kind)}"
-            assert main(["new", str(path), *kind, "--output", str(made)]) == 0
+            ran("new", path, *kind, "--output", made)
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")

@@ -1,9 +1,7 @@
 """The settings that ``fmugym validate`` recommends, for models whose needs are known."""
 
 import math
-import os
 import re
-import subprocess
 import sys
 import tomllib
 from dataclasses import replace
@@ -16,13 +14,13 @@ import numpy as np
 import pytest
 import zoo_tools
 from gymnasium import spaces
+from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
 from fmugym.declared import Task, load
 from fmugym.tools import advice as advice_tools
 from fmugym.tools.accuracy import Replay, substeps_of
-from fmugym.tools.cli import main
 from fmugym.tools.findings import lines_of
 from fmugym.tools.validation import validate
 
@@ -94,11 +92,12 @@ def test_needless_substeps_are_told(lag, monkeypatch):
     assert 2 <= advice["substeps"] <= 16
 
 
-def test_lines_can_be_written_into_the_file(lag, tmp_path, capsys):
+def test_lines_can_be_written_into_the_file(lag, tmp_path, cli):
     path = tmp_path / "a.toml"
     lag_task(lag, 1000.0).write(path)
-    assert main(["validate", str(path)]) in (0, 1)
-    _, _, lines = capsys.readouterr().out.partition("for the task file:\n")
+    code, out, _ = cli("validate", path)
+    assert code in (0, 1)
+    _, _, lines = out.partition("for the task file:\n")
     document = tomllib.loads(path.read_text())
     pasted = tomllib.loads(lines)
     assert pasted["substeps"] > 25
@@ -216,13 +215,14 @@ class TestEpisodeLength:
 
 
 @pytest.mark.parametrize("reward", ["-1e-6 * q**2", "-1 - 1e-11 * q**2", "2 + 1e-11 * q"])
-def test_a_tiny_reward_beside_large_actions_gets_lines(reward, tmp_path, capsys):
+def test_a_tiny_reward_beside_large_actions_gets_lines(reward, tmp_path, cli):
     """With them, rewards have the size of 1, and begin near 0."""
     variables = {"tau": {"min": -200, "max": 200}}
     task = pendulum(variables=variables, reward=reward, time_step=0.001, episode_length=0.05)
     task.write(tmp_path / "a.toml")
-    assert main(["validate", str(tmp_path / "a.toml")]) in (0, 1)
-    _, _, lines = capsys.readouterr().out.partition("for the task file:\n")
+    code, out, _ = cli("validate", tmp_path / "a.toml")
+    assert code in (0, 1)
+    _, _, lines = out.partition("for the task file:\n")
     pasted = tomllib.loads(lines)
     assert pasted["agent"]["rescale"] is True
     env = load(Task.from_dict({**task.document, "reward": pasted["reward"]}))
@@ -365,8 +365,7 @@ def test_what_an_fmu_prints_is_not_in_the_output(tmp_path, options):
     """It prints whenever an instance is made, also while the process ends."""
     calls = zoo_tools.FAULTS.index("print"), zoo_tools.CALLS.index("instantiate")
     path = zoo_tools.zoo_fmu(tmp_path, 2, "{{zoo {} {} 0}}".format(*calls))
-    command = [sys.executable, "-m", "fmugym", "validate", str(path), *options]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = run_python("-m", "fmugym", "validate", path, *options, cwd=tmp_path)
     assert done.returncode == 0
     printed = "a line of the zoo"
     assert printed not in done.stdout
@@ -380,8 +379,7 @@ def test_what_an_fmu_prints_is_not_in_the_output(tmp_path, options):
 
 
 def test_nothing_is_told_and_no_file_stays_if_an_fmu_prints_nothing(tmp_path):
-    command = [sys.executable, "-m", "fmugym", "bench", "fmugym/CartPole-v0", "--seconds", "0.01"]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
+    command = "bench", "fmugym/CartPole-v0", "--seconds", "0.01"
+    done = run_python("-m", "fmugym", *command, environment={"TMPDIR": str(tmp_path)})
     assert (done.returncode, done.stderr) == (0, "")
     assert list(tmp_path.iterdir()) == []

@@ -37,13 +37,11 @@ class TestRecord:
         played = cli("simulate", "fmugym/House-v0", "--controller", PID, *FROST, "--json")
         assert json.loads(played[1])["episodes"] == episodes
 
-    def test_several_files_at_once(self, tmp_path, cli):
+    def test_several_files_at_once(self, tmp_path, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         paths = [tmp_path / name for name in ("a.csv", "b.csv", "a.png", "a.html")]
         outputs = [text for path in paths for text in ("--output", path)]
-        code, out, _ = cli("simulate", CART_POLE, "--seed", "3", *outputs)
-        assert code == 0
-        assert out.startswith("seed 3: reward")
+        assert ran("simulate", CART_POLE, "--seed", "3", *outputs).startswith("seed 3: reward")
         assert paths[0].read_text() == paths[1].read_text() != ""
         assert paths[2].read_bytes().startswith(b"\x89PNG")
         page = paths[3].read_text(encoding="utf-8")
@@ -53,22 +51,20 @@ class TestRecord:
         assert "<h1>cart_pole.toml</h1>" in page
         assert str(Path(CART_POLE).parent) not in page
 
-    def test_a_report_compares_controllers(self, tmp_path, cli):
+    def test_a_report_compares_controllers(self, tmp_path, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         path = tmp_path / "a.html"
         who = "--action", "-10", "--action", "10"
-        code, out, _ = cli("simulate", CART_POLE, *who, "--output", path)
-        assert code == 0
+        out = ran("simulate", CART_POLE, *who, "--output", path)
         assert [line.split(":")[0] for line in out.splitlines()] == ["action -10", "action 10"]
         page = path.read_text(encoding="utf-8")
         assert page.count("<figure>") == 2
         assert "<h2>action 10</h2>" in page
 
-    def test_parquet(self, tmp_path, cli):
+    def test_parquet(self, tmp_path, ran):
         pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
         path = tmp_path / "a.parquet"
-        code, *_ = cli("simulate", CART_POLE, "--output", path)
-        assert code == 0
+        ran("simulate", CART_POLE, "--output", path)
         assert TimeSeries.read(path)["reward"].sum() == len(TimeSeries.read(path)) - 1
 
     @pytest.mark.parametrize("error", [KeyboardInterrupt, fmugym.SimulationError])
@@ -83,11 +79,9 @@ class TestRecord:
         assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
         assert "stopped" in (tmp_path / "a.html").read_text(encoding="utf-8")
 
-    def test_without_matplotlib_the_extra_is_named(self, tmp_path, cli, monkeypatch):
+    def test_without_matplotlib_the_extra_is_named(self, tmp_path, refused, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
-        code, _, err = cli("simulate", CART_POLE, "--output", tmp_path / "a.html")
-        assert code == 1
-        assert ".[plot]" in err
+        assert ".[plot]" in refused("simulate", CART_POLE, "--output", tmp_path / "a.html")
 
 
 class TestEvaluate:
@@ -111,14 +105,12 @@ class TestEvaluate:
         assert len(ticks) > 2
         assert float(ticks[0]) - float(ticks[-1]) > 0.1
 
-    def test_several_scenarios_and_a_picture(self, tmp_path, cli):
+    def test_several_scenarios_and_a_picture(self, tmp_path, cli, ran):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         path = tmp_path / "a.png"
         options = "--steps", "10", "--episodes", "2", "--action", "0", "--plot", path
         both = "--scenario", "frost", "--scenario", "spring"
-        code, out, _ = cli("evaluate", "fmugym/House-v0", *both, *options, "--json")
-        assert code == 0
-        scores = json.loads(out)["scores"]
+        scores = json.loads(ran("evaluate", "fmugym/House-v0", *both, *options, "--json"))["scores"]
         assert [(one["name"], one["scenario"]) for one in scores] == [
             *(("random", "frost"), ("action 0", "frost")),
             *(("random", "spring"), ("action 0", "spring")),
@@ -138,21 +130,18 @@ class TestEvaluate:
         found = {one["name"]: len(one["rewards"]) for one in json.loads(out)["scores"]}
         assert found == {"random": 2, "action 0": 1}
 
-    def test_all_scenarios(self, cli):
+    def test_all_scenarios(self, ran):
         options = "--scenario", "all", "--steps", "2", "--episodes", "1"
-        code, out, _ = cli("evaluate", "fmugym/House-v0", *options)
-        assert code == 0
+        out = ran("evaluate", "fmugym/House-v0", *options)
         assert [line.split("  ")[0] for line in out.splitlines()[1:]] == [
             f"random ({name})" for name in ("autumn", "frost", "spring")
         ]
 
 
 class TestBench:
-    def test_speeds_of_one_and_of_many(self, cli):
+    def test_speeds_of_one_and_of_many(self, ran):
         options = "--envs", "4", "--envs", "16", "--seconds", "0.05"
-        code, out, _ = cli("bench", CART_POLE, *options, "--json")
-        assert code == 0
-        report = json.loads(out)
+        report = json.loads(ran("bench", CART_POLE, *options, "--json"))
         assert [one["envs"] for one in report["speeds"]] == [0, 4, 16]
         for one in report["speeds"]:
             count = max(1, one["envs"])
@@ -173,9 +162,8 @@ class TestBench:
         assert all(0 < one.fmu_share <= 1 for one in report.speeds)
         assert caplog.text == ""  # a pendulum without a mass would be an error
 
-    def test_a_table_with_words_of_caution(self, cli):
-        code, out, _ = cli("bench", CART_POLE, "--envs", "4", "--seconds", "0.02")
-        assert code == 0
+    def test_a_table_with_words_of_caution(self, ran):
+        out = ran("bench", CART_POLE, "--envs", "4", "--seconds", "0.02")
         assert out.isascii()
         assert "single" in out
         assert "busy" in out
@@ -183,7 +171,7 @@ class TestBench:
 
 class TestProgress:
     @pytest.mark.parametrize("is_terminal", [False, True])
-    def test_bars_are_for_terminals(self, is_terminal, cli, monkeypatch):
+    def test_bars_are_for_terminals(self, is_terminal, ran, monkeypatch):
         bars = []
 
         class Bar:
@@ -202,8 +190,7 @@ class TestProgress:
         monkeypatch.setitem(sys.modules, "tqdm", SimpleNamespace(tqdm=Bar))
         monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
         options = "--steps", "3", "--episodes", "2"
-        code, *_ = cli("simulate", "fmugym/House-v0", *options)
-        assert code == 0
+        ran("simulate", "fmugym/House-v0", *options)
         assert bars == ([(6, [1] * 6)] if is_terminal else [])
 
     def test_without_tqdm_there_are_none(self, cli, monkeypatch):

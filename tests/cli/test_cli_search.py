@@ -170,14 +170,14 @@ class TestCourse:
         assert content(parts) == content(folder)
         assert curve(parts) == curve(folder)
 
-    def test_a_resumed_search_may_be_longer(self, whole, task, tmp_path, cli, searched):
+    def test_a_resumed_search_may_be_longer(self, whole, task, tmp_path, ran, searched):
         """And is then like one that was as long from the beginning."""
         options = "--rounds", ROUNDS + 12
         code, *_ = searched(task, tmp_path / "longer", *options)
         assert code == 0
         folder = shutil.copytree(whole[0], tmp_path / "whole")
         options = "--output", folder, "--episodes", "3", *options, "--resume"
-        assert cli("train", task, *options)[0] == 0
+        ran("train", task, *options)
         assert content(folder) == content(tmp_path / "longer")
 
     @pytest.mark.parametrize("ceiling", [20_000, 60_000, 75_000])
@@ -267,15 +267,13 @@ CRANE = {
     [("fmugym/CartPole-v0", 50, 475), ("fmugym/CloudPendulum-v0", 100, -95), (CRANE, 150, -75)],
     ids=["cart-pole", "cloud-pendulum", "crane"],
 )
-def test_targets_are_reached(task, rounds, target, tmp_path, cli):
+def test_targets_are_reached(task, rounds, target, tmp_path, ran):
     """By the mean of 100 episodes of the test."""
     if task is CRANE:
         task = tmp_path / "crane.toml"
         fmugym.Task.from_dict(CRANE).write(task)
     options = "--output", tmp_path / "a", "--rounds", rounds, "--json"
-    code, out, err = cli("train", task, *options)
-    assert code == 0, err
-    told = json.loads(out)
+    told = json.loads(ran("train", task, *options))
     assert told["test"][told["agent"]]["total_reward"] >= target
     assert len(told["test"][told["agent"]]["rewards"]["unseen episodes"]) == 100
 
@@ -437,28 +435,22 @@ class TestOutput:
 
 
 class TestAgents:
-    def test_all_who_play_take_them(self, whole, task, tmp_path, cli):
+    def test_all_who_play_take_them(self, whole, task, tmp_path, ran):
         folder, told = whole[0], facts_of(whole[0])
         expected = told["test"][told["agent"]]["rewards"]["unseen episodes"]
         options = "--agent", folder, "--episodes", "3", "--seed", "1000000", "--json"
-        code, out, _ = cli("evaluate", task, *options)
-        assert code == 0
-        assert json.loads(out)["scores"][1]["rewards"] == expected
-        code, out, _ = cli("simulate", task, *options)
-        assert code == 0
+        assert json.loads(ran("evaluate", task, *options))["scores"][1]["rewards"] == expected
+        out = ran("simulate", task, *options)
         assert [one["total_reward"] for one in json.loads(out)["episodes"]] == expected
         table = tmp_path / "table.csv"
-        code, out, _ = cli("simulate", task, *options, "--output", table)
-        assert code == 0
+        out = ran("simulate", task, *options, "--output", table)
         assert [one["total_reward"] for one in json.loads(out)["runs"][str(folder)]] == expected
         assert table.exists()
 
-    def test_beside_controllers_they_reach_what_the_verdict_tells(self, whole, task, cli):
+    def test_beside_controllers_they_reach_what_the_verdict_tells(self, whole, task, ran):
         told = facts_of(whole[0])["test"]["lazy"]
         options = "--controller", "lazy", "--episodes", "3", "--json"
-        code, out, _ = cli("evaluate", task, *options)
-        assert code == 0
-        score = json.loads(out)["scores"][1]
+        score = json.loads(ran("evaluate", task, *options))["scores"][1]
         assert score["rewards"] == told["rewards"]["unseen episodes"]
         assert score["mean_cost"] == pytest.approx(told["mean_costs"]["effort"])
 

@@ -107,11 +107,10 @@ class TestEvaluate:
         assert low < np.mean(lengths) < high
         assert scores[2]["ends"] == {"terminated": 4}
 
-    def test_a_table_with_costs_and_a_scenario(self, tmp_path, cli):
+    def test_a_table_with_costs_and_a_scenario(self, tmp_path, ran):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         arguments = "--scenario", "late", "--action", "0.1", "--episodes", "2"
-        code, out, _ = cli("evaluate", tmp_path / "a.toml", *arguments)
-        assert code == 0
+        out = ran("evaluate", tmp_path / "a.toml", *arguments)
         header, random, constant = (line.split() for line in out.splitlines())
         assert header[:4] == ["reward", "+-", "cost", "steps"]
         assert random[0] == "random"

@@ -9,7 +9,6 @@ import gymnasium
 import pygame
 import pytest
 
-from fmugym.tools.cli import main
 from fmugym.tools.demo import arena_of_demo, train
 
 
@@ -47,16 +46,13 @@ def test_it_gives_up_after_the_most_rounds():
     assert len(trained(0, most=1)) == 1
 
 
-def test_without_a_display_it_writes_a_picture(tmp_path, capsys):
+def test_without_a_display_it_writes_a_picture(tmp_path, refused, ran):
     path = tmp_path / "demo.png"
-    assert main(["demo", "--output", str(path)]) == 0
-    assert "of 500" in capsys.readouterr().out
+    assert "of 500" in ran("demo", "--output", path)
     width, height = pygame.image.load(path).get_size()
     assert width > 2 * height
-    assert main(["demo", "--output", str(path)]) == 1
-    assert "demo.png" in capsys.readouterr().err
-    assert main(["demo", "--output", str(tmp_path / "demo.jpg")]) == 1
-    assert "demo.jpg" in capsys.readouterr().err
+    assert "demo.png" in refused("demo", "--output", path)
+    assert "demo.jpg" in refused("demo", "--output", tmp_path / "demo.jpg")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="takes the display away as X11 has it")

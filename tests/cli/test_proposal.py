@@ -10,48 +10,45 @@ from test_cli import INPUT, OUTPUT, variable
 
 import fmugym
 from fmugym.archive.bundled import MODELS
-from fmugym.tools.cli import main
 
 make_fmu = test_cli.make_fmu
 
 
-def proposed(capsys, fmu):
+def proposed(ran, fmu):
     """The task and the notes."""
-    assert main(["new", str(fmu), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    told = json.loads(ran("new", fmu, "--json"))
     return told["task"], "\n".join(told["notes"])
 
 
 @pytest.fixture
-def new(capsys):
-    return lambda fmu: proposed(capsys, fmu)
+def new(ran):
+    return lambda fmu: proposed(ran, fmu)
 
 
-def trained(folder, capsys, fmu):
+def trained(folder, ran, fmu):
     """The facts of the agent that a newcomer gets by two commands."""
     path, agent = folder / "task.toml", folder / "agent"
-    assert main(["new", str(fmu), "--output", str(path)]) == 0
+    ran("new", fmu, "--output", path)
     options = "--rounds", "30", "--episodes", "2"
-    code = main(["train", str(path), "--output", str(agent), *options])
-    assert code == 0, capsys.readouterr().err
+    ran("train", path, "--output", agent, *options)
     return json.loads((agent / "agent.json").read_text())
 
 
 @pytest.mark.parametrize("maker", MADE)
-def test_foreign_fmus_train_without_editing(maker, tmp_path, capsys):
+def test_foreign_fmus_train_without_editing(maker, tmp_path, ran):
     (tmp_path / "made").mkdir()
-    facts = trained(tmp_path, capsys, MADE[maker].build(tmp_path / "made"))
+    facts = trained(tmp_path, ran, MADE[maker].build(tmp_path / "made"))
     assert facts["rounds"] == 30
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_types_of_every_kind_train_without_editing(version, tmp_path, capsys):
-    assert trained(tmp_path, capsys, probe_fmu(tmp_path, version))["rounds"] == 30
+def test_types_of_every_kind_train_without_editing(version, tmp_path, ran):
+    assert trained(tmp_path, ran, probe_fmu(tmp_path, version))["rounds"] == 30
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_bundled_fmus_train_without_editing(model, tmp_path, capsys):
-    assert trained(tmp_path, capsys, fmugym.bundled_fmu(model))["rounds"] == 30
+def test_bundled_fmus_train_without_editing(model, tmp_path, ran):
+    assert trained(tmp_path, ran, fmugym.bundled_fmu(model))["rounds"] == 30
 
 
 def test_weather_and_people_are_no_actions(new):
@@ -124,7 +121,7 @@ def test_a_length_that_nobody_gives_is_a_guess(make_fmu, new):
     assert "episode_length" not in new(fmugym.bundled_fmu("CartPole"))[1]
 
 
-def test_guesses_are_marked_in_the_file(capsys):
-    assert main(["new", str(fmugym.bundled_fmu("House"))]) == 0
-    marked = [line for line in capsys.readouterr().out.splitlines() if "TODO: a guess" in line]
+def test_guesses_are_marked_in_the_file(ran):
+    out = ran("new", fmugym.bundled_fmu("House"))
+    marked = [line for line in out.splitlines() if "TODO: a guess" in line]
     assert [line.split(" =")[0] for line in marked] == ["reward", "T_air_set"]

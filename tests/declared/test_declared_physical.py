@@ -13,7 +13,6 @@ from fmugym import FMUVectorEnv, Task, TaskEnv
 from fmugym.baselines import PID, Constant, Hysteresis, Random, Schedule
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.errors import ConfigError
-from fmugym.tools.cli import main
 
 STEPS = 48
 
@@ -196,9 +195,8 @@ OWN = {"half": 0.5, "own": "pid of=T setpoint=21 kp=1"}
 
 
 class TestCommandLine:
-    def found(self, capsys, *arguments):
-        assert main([*map(str, arguments), "--steps", "48", "--json"]) == 0
-        return json.loads(capsys.readouterr().out)
+    def found(self, ran, *arguments):
+        return json.loads(ran(*arguments, "--steps", "48", "--json"))
 
     def files(self, kind, tmp_path):
         """The task, and the same with a form for agents."""
@@ -208,27 +206,27 @@ class TestCommandLine:
             yield path
 
     @pytest.mark.parametrize("kind", ["levels", "delta"])
-    def test_all_who_are_no_agents_play_as_without_its_form(self, kind, tmp_path, capsys):
+    def test_all_who_are_no_agents_play_as_without_its_form(self, kind, tmp_path, ran):
         pid = "--controller", "own"
         players = *pid, "--controller", "half", "--action", "0.4", "--episodes", "1"
         search = "pid of=T setpoint=20..22 kp=1", "--rounds", "1", "--candidates", "8"
         results = []
         for path in self.files(kind, tmp_path):
             table = tmp_path / f"{path.stem}.csv"
-            one = self.found(capsys, "simulate", path, *pid)["episodes"]
-            two = self.found(capsys, "simulate", path, *pid, "--output", table, "--variables", "u")
-            three = self.found(capsys, "tune", path, *search, "--episodes", "1")
-            _, *scores = self.found(capsys, "evaluate", path, *players)["scores"]
+            one = self.found(ran, "simulate", path, *pid)["episodes"]
+            two = self.found(ran, "simulate", path, *pid, "--output", table, "--variables", "u")
+            three = self.found(ran, "tune", path, *search, "--episodes", "1")
+            _, *scores = self.found(ran, "evaluate", path, *players)["scores"]
             four = [(score["name"], score["rewards"]) for score in scores]
             results.append((one, two["runs"], three["rewards_of_rounds"], table.read_text(), four))
         assert results[0] == results[1]
 
-    def test_a_class_whose_task_stays_as_it_is_tells_the_cure(self, capsys):
+    def test_a_class_whose_task_stays_as_it_is_tells_the_cure(self, refused, ran):
         for player in (("--controller", "pid of=T setpoint=21 kp=1"), ("--action", "0.5")):
-            assert main(["simulate", "test_declared_physical:Rescaled", *player]) == 1
-            assert "'rescale'" in (told := capsys.readouterr().err)
+            told = refused("simulate", "test_declared_physical:Rescaled", *player)
+            assert "'rescale'" in told
             assert "Task.physical()" in told
-        assert main(["simulate", "test_declared_physical:Rescaled", "--steps", "3"]) == 0
+        ran("simulate", "test_declared_physical:Rescaled", "--steps", "3")
 
 
 class Rescaled(TaskEnv):

@@ -9,7 +9,6 @@ from vector_tools import require_same_alone
 import fmugym
 from fmugym import Task
 from fmugym.errors import TaskError
-from fmugym.tools.cli import main
 
 DAY = 86400.0
 TASK = {
@@ -94,7 +93,7 @@ SCENARIOS = TASK | {
 }
 
 
-def test_a_scenario_is_an_environment(tmp_path, capsys):
+def test_a_scenario_is_an_environment(tmp_path, refused, ran):
     Task.from_dict(SCENARIOS).write(tmp_path / "task.toml")
     path = str(tmp_path / "task.toml")
     env = gymnasium.make("fmugym/FMU-v0", config=path, scenario="peak").unwrapped
@@ -105,10 +104,8 @@ def test_a_scenario_is_an_environment(tmp_path, capsys):
     envs = gymnasium.make_vec("fmugym/FMU-v0", num_envs=2, config=path, scenario="mild")
     assert envs.reset(seed=0)[0][:, 0].tolist() == [0, 0]
     envs.close()
-    assert main(["simulate", path, "--scenario", "peak"]) == 0
-    assert "reward 56 in 4 steps" in capsys.readouterr().out
-    assert main(["simulate", path, "--scenario", "peek"]) == 1
-    assert "'peak'" in capsys.readouterr().err
+    assert "reward 56 in 4 steps" in ran("simulate", path, "--scenario", "peak")
+    assert "'peak'" in refused("simulate", path, "--scenario", "peek")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from fmugym import ConfigError
 from fmugym.baselines import controller_of as controller_from
 from fmugym.export import agent_of, write_c, write_fmu
 from fmugym.search.policy import Agent, Policy
-from fmugym.tools.cli import main
 
 UNSCALED = np.array([[0.0], [1.0]])
 LINEAR = Agent("by hand", None, 1, 1)  # each task replaces the sizes
@@ -245,10 +244,10 @@ class TestRefused:
         env.close()
 
 
-def test_by_the_command_line(tmp_path, capsys, load):
+def test_by_the_command_line(tmp_path, ran, load):
     task = "examples/cart_pole.toml"
     env = load(task, physical=True)
     agent_for(env, "pid of=phi setpoint=0 kp=-100 td=0.1", HISTORY).save(tmp_path)
-    main(["export", str(tmp_path), "--task", task, "--output", str(tmp_path / "agent.c")])
-    assert "measurement phi rad" in capsys.readouterr().out
+    said = ran("export", tmp_path, "--task", task, "--output", tmp_path / "agent.c")
+    assert "measurement phi rad" in said
     assert "agent_controller[2]" in (tmp_path / "agent.h").read_text()

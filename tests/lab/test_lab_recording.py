@@ -2,15 +2,14 @@
 
 import importlib.util
 import subprocess
-import sys
 from pathlib import Path
 from urllib.parse import urlparse
 from urllib.request import url2pathname
 
-import building
 import numpy as np
 import pytest
 from lab_tools import TOKEN, experiment, track
+from process_tools import run_python
 
 from fmugym import ConfigError
 from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, videos
@@ -190,13 +189,7 @@ from fmugym.lab import Lab, ManualClock
 client, token = experiment(Lab("ideal", clock=ManualClock()), record=True)
 print(client.stop_experiment(token))
 """
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        cwd=building.HERE / "tools",
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-W", "error", "-c", code)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("file://")
     assert list(temp_root.iterdir()) == []

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from process_tools import run_python
 from setuptools import Extension
 
 import build_backend
@@ -117,8 +118,7 @@ def test_free_threaded_python_is_refused():
     script = "import sysconfig, runpy\n"
     script += "sysconfig.get_config_vars()['Py_GIL_DISABLED'] = 1\n"
     script += "runpy.run_path('setup.py')"
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = run_python("-c", script, cwd=ROOT)
     assert done.returncode != 0
     assert "free-threaded Python is not supported" in done.stderr
 

@@ -53,7 +53,7 @@ def count(folder, jobs, rest=2, rounds=50, program=COUNT):
         program: The text of the Python program.
     """
     jobs = [(*job, rest, rounds) for job in jobs]
-    done = run_python("-c", program, str(busy_fmu(folder)), json.dumps(jobs))
+    done = run_python("-c", program, busy_fmu(folder), json.dumps(jobs))
     assert done.returncode == 0, done.stderr
     return [counted | {"rounds": rounds} for counted in json.loads(done.stdout)]
 

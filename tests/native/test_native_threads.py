@@ -39,7 +39,7 @@ on_posix = pytest.mark.skipif(os.name != "posix", reason="Windows has no timer s
 @pytest.mark.parametrize("options", [("1",), ("2", "python")], ids=["C", "Python"])
 def test_stress(options):
     """A short form of what ``sanitize.py`` does with sanitizers."""
-    done = run_python(str(HERE / "tools" / "native_stress.py"), "3", *options)
+    done = run_python(HERE / "tools" / "native_stress.py", 3, *options)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "Traceback" not in done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["played"] > 10
@@ -114,7 +114,7 @@ os._exit(0)  # pythonfmu may crash at the end of the interpreter
 
 def test_an_fmu_in_python_and_calls_from_several_threads(tank):
     """It needs the GIL while it is stepped: who has that must not wait for the pool."""
-    done = run_python("-c", DEADLOCK, str(tank))
+    done = run_python("-c", DEADLOCK, tank)
     assert done.stdout == "2000\n", done.stderr[-3000:]
 
 
@@ -160,7 +160,7 @@ def test_an_fmu_that_calls_its_own_pool_gets_an_error(tmp_path, tank):
     source = tmp_path / "selfish.py"
     source.write_text(CALLS_ITS_POOL)
     path = FmuBuilder.build_FMU(str(source), dest=tmp_path)
-    done = run_python("-c", REENTRANT, str(path))
+    done = run_python("-c", REENTRANT, path)
     expected = [0, 0], ["an FMU has called the pool that it is in"] * 4
     assert done.stdout == "{} {}\n".format(*expected), done.stderr[-3000:]
 
@@ -408,7 +408,7 @@ def test_a_signal_ends_a_loop_of_steps_that_log(probe, error):
 
     In a process of its own: an exception out of a signal handler leaves coverage's lock locked.
     """
-    done = run_python("-c", SIGNALS, str(probe()), error, "400")
+    done = run_python("-c", SIGNALS, probe(), error, 400)
     assert done.stdout == "400 of 400\n", done.stdout + done.stderr
     assert done.stderr == ""
 

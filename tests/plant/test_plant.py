@@ -35,7 +35,6 @@ from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
 from fmugym.plant.polling import LostError, Poller
 from fmugym.series import RecordSeries
-from fmugym.tools.cli import main
 from fmugym.tools.shadows import evaluate_log
 
 
@@ -586,32 +585,30 @@ class TestCommands:
         house().write(tmp_path / "house.toml")
         return "house.toml"
 
-    def test_serve(self, file, capsys):
+    def test_serve(self, file, ran):
         arguments = ["--controller", "thermostat", "--speed", "90000", "--steps", "3"]
-        assert main(["serve", file, *arguments]) == 0
-        said = capsys.readouterr().out
+        said = ran("serve", file, *arguments)
         assert re.search(r"house.toml at 127.0.0.1:\d+", said)
         reward = reference(3)["reward"].sum()
         assert f"seed 0: reward {reward:.6g}, cost" in said
         assert "in 3 steps (2700 s)" in said
 
-    def test_simulate_plant(self, file, clock, capsys, monkeypatch):
+    def test_simulate_plant(self, file, clock, monkeypatch, ran):
         monkeypatch.setattr("fmugym.tools.plants.RealClock", lambda speed: clock)
         controller = "pid of=T setpoint=21 kp=0.5 ti=14400"
         with Server(house(), "thermostat", clock=clock) as server:
             given = ["--plant", server.address, "--ahead", "30min", "--steps", "6"]
             given += ["--controller", controller, "--output", "plant.csv"]
-            assert main(["simulate", file, *given]) == 0
-            said = capsys.readouterr().out
-            assert main(["simulate", file, *given, "--json", "--force"]) == 0
+            said = ran("simulate", file, *given)
+            out = ran("simulate", file, *given, "--json", "--force")
         assert re.search(r"error of T, .* 900 s ahead, .* 1800 s ahead", said)
-        told = json.loads(capsys.readouterr().out)
+        told = json.loads(out)
         assert told["episodes"][0]["steps"] == 6
         assert {one["ahead"] for one in told["predictions"]} == {900.0, 1800.0}
         log = PlantLog.read("plant.csv")
         others = "--controller", "thermostat", "--json"
-        assert main(["evaluate", file, "--log", "plant.csv", *others]) == 0
-        scores = {one["name"]: one for one in json.loads(capsys.readouterr().out)["scores"]}
+        out = ran("evaluate", file, "--log", "plant.csv", *others)
+        scores = {one["name"]: one for one in json.loads(out)["scores"]}
         assert [*scores][:3] == ["plant, measured", "actions of the plant", "proposed actions"]
         assert [*scores][3:] == ["thermostat"]
         assert {tuple(one["steps"]) for one in scores.values()} == {(6,)}
@@ -621,23 +618,22 @@ class TestCommands:
         assert scores["proposed actions"]["rewards"] != scores["actions of the plant"]["rewards"]
         assert np.all((log.columns["proposed.u"][1:] >= 0) & (log.columns["proposed.u"][1:] <= 1))
 
-    def test_a_task_without_a_plant(self, tmp_path, monkeypatch, capsys):
+    def test_a_task_without_a_plant(self, tmp_path, monkeypatch, refused):
         monkeypatch.chdir(tmp_path)
         task = house()
         del task.document["plant"]
         task.write(tmp_path / "house.toml")
         for command in (["simulate", "house.toml", "--plant"], ["serve", "house.toml"]):
-            assert main(command) == 1
-            assert "[plant]" in capsys.readouterr().err
+            err = refused(*command)
+            assert "[plant]" in err
         others = ["--scenario", "frost"]
         for command in (["simulate", "--plant"], ["evaluate", "--log", "plant.csv"]):
-            assert main([command[0], "house.toml", *command[1:], *others]) == 1
-            assert "--scenario" in capsys.readouterr().err
-        assert main(["serve", "house.toml"]) == 1
-        assert "--modbus or --opcua" in capsys.readouterr().err
+            err = refused(command[0], "house.toml", *command[1:], *others)
+            assert "--scenario" in err
+        assert "--modbus or --opcua" in refused("serve", "house.toml")
 
     @pytest.mark.parametrize("protocol", ["modbus", "opcua"])
-    def test_serve_proposes_tags(self, protocol, shadowed, tmp_path, monkeypatch, capsys):
+    def test_serve_proposes_tags(self, protocol, shadowed, tmp_path, monkeypatch, refused, ran):
         """With what is printed, the task reads all that it needs: here 48 hours of prices."""
         if protocol == "opcua":
             pytest.importorskip("asyncua", reason="needs asyncua, of the extra plant")
@@ -647,8 +643,8 @@ class TestCommands:
         del task.document["plant"]
         task.write(tmp_path / "house.toml")
         options = ["--speed", "90000", "--steps", "2"]
-        assert main(["serve", "house.toml", f"--{protocol}", *options]) == 0
-        said = capsys.readouterr().out.partition("add this to the task:\n")[2]
+        out = ran("serve", "house.toml", f"--{protocol}", *options)
+        said = out.partition("add this to the task:\n")[2]
         with Path("house.toml").open("a", encoding="utf-8") as file:
             file.write(said.partition("seed 0:")[0])
         pasted = Task.read("house.toml")
@@ -664,11 +660,11 @@ class TestCommands:
         assert seen["price[+172800 s]"] == pytest.approx(table.values[here], rel=1e-6)
         assert seen["T"] == pytest.approx(20.0, abs=1.5)
         other = {"modbus": "opcua", "opcua": "modbus"}[protocol]
-        assert main(["serve", "house.toml", f"--{other}", *options]) == 1
-        assert f"protocol '{protocol}', not '{other}'" in capsys.readouterr().err
+        err = refused("serve", "house.toml", f"--{other}", *options)
+        assert f"protocol '{protocol}', not '{other}'" in err
 
-    def test_a_tag_of_no_variable(self, file, capsys):
+    def test_a_tag_of_no_variable(self, file, refused):
         text = Path(file).read_text()
         Path(file).write_text(text.replace("\nT = {register", "\nTt = {register"))
-        assert main(["simulate", file, "--plant"]) == 1
-        assert "plant.tags.Tt: unknown variable of the task 'Tt'" in capsys.readouterr().err
+        err = refused("simulate", file, "--plant")
+        assert "plant.tags.Tt: unknown variable of the task 'Tt'" in err

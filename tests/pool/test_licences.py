@@ -18,7 +18,6 @@ from fmugym.config import EnvConfig
 from fmugym.errors import LicenceError
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.tools.cli import main
 from fmugym.trial import rehearsal
 from fmugym.trial.known import known_verdict
 from fmugym.trial.subject import Subject
@@ -131,7 +130,7 @@ class TestLimits:
         assert licences.most == 0
 
     @pytest.mark.parametrize(("count", "text"), [(1, "1 instance at"), (2, "2 instances at")])
-    def test_the_trial_says_how_many_it_used(self, folder, licences, caplog, capsys, count, text):
+    def test_the_trial_says_how_many_it_used(self, folder, licences, caplog, cli, count, text):
         caplog.set_level(logging.INFO, "fmugym")
         licences.limit(count)
         path = make_fmu(folder, "licensed")
@@ -139,8 +138,7 @@ class TestLimits:
         assert licences.most == count
         assert known_verdict(fmugym.FMU(path)).instances == count
         assert f"was tried with {count} instance(s) at once" in caplog.text
-        main(["info", str(path)])
-        assert f"tried with {text} once" in capsys.readouterr().out
+        assert f"tried with {text} once" in cli("info", path)[1]
 
 
 class TestRefusal:
@@ -257,7 +255,7 @@ class TestInitializations:
     """A trial says how many it took, and takes fewer where they are slow or need licences."""
 
     @pytest.mark.parametrize(("config", "most"), [({}, 9), ({"licence_wait": 1.0}, 6)])
-    def test_of_one_environment(self, folder, licences, caplog, capsys, config, most):
+    def test_of_one_environment(self, folder, licences, caplog, config, most, ran):
         caplog.set_level(logging.INFO, "fmugym")
         path = make_fmu(folder, "licensed")
         DemandingEnv(path, **config).close()
@@ -266,8 +264,7 @@ class TestInitializations:
         assert verdict.reset_method == "restore"
         text = f"and {verdict.initializations} initialization(s) in all"
         assert text in caplog.text
-        assert main(["info", str(path)]) == 0
-        assert f"{verdict.initializations} initializations" in capsys.readouterr().out
+        assert f"{verdict.initializations} initializations" in ran("info", path)
         left_out = "no episode returned to earlier start values" in "".join(verdict.reasons)
         assert left_out == bool(config)
 

@@ -5,7 +5,6 @@ import math
 import re
 
 import exchange_tools
-import fmpy
 import fmu_tools
 import numpy as np
 import pytest
@@ -249,24 +248,6 @@ class TestEvents:
         assert fmu.description.model_exchange.number_of_states == 2
         found = run(opened(open_pool(fmu, (), ["mode"])), 600)[:, 0]
         assert found.tolist() == [row[2] for row in stick_and_slip(0.1, 600)]
-
-    def test_agreement_with_fmpy(self, fmu_path, make_pool):
-        for model, outputs in (("ball", ["h", "v"]), ("circuit", ["voltage"])):
-            values = {"limit": 0.42} if model == "circuit" else {}
-            result = fmpy.simulate_fmu(
-                str(fmu_path(model)),
-                fmi_type="ModelExchange",
-                stop_time=60 * 0.0317,
-                output_interval=0.0317,  # no event is there: FMPy fails where two coincide
-                relative_tolerance=1e-9,
-                output=outputs,
-                start_values=values,
-                record_events=False,
-            )
-            pool = make_pool(model, 0.0317, outputs=outputs, tolerance=1e-9)
-            found = run(pool, 60, values)
-            expected = np.array([result[name] for name in outputs]).T
-            np.testing.assert_allclose(found, expected, atol=1e-5)
 
     def test_time_does_not_drift(self, make_pool):
         """The period of the source stays where it is through a million steps."""

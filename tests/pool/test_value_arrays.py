@@ -24,7 +24,6 @@ import fmugym
 from fmugym import Choice, ConfigError, Uniform
 from fmugym.series import RecordSeries
 from fmugym.testing import check_fmu_env
-from fmugym.tools import cli
 
 A = np.array([[-1.0, 0.5], [0.0, -2.0]])
 
@@ -262,17 +261,17 @@ def test_a_task_file_names_elements(state_space, tmp_path):
 
 
 @pytest.mark.parametrize("words", [(), ("--class",)], ids=["task", "class"])
-def test_fmugym_new_knows_elements(state_space, tmp_path, capsys, words):
+def test_fmugym_new_knows_elements(state_space, tmp_path, words, ran):
     path = tmp_path / ("new.py" if words else "new.toml")
-    assert cli.main(["new", str(state_space), "--output", str(path), *words]) == 0
+    ran("new", state_space, "--output", path, *words)
     text = path.read_text()
     for name in ("u[1]", "y[1]", "y[2]", "y[3]", "x[1]", "x[2]"):
         assert f'"{name}"' in text
     assert "[[-1.0, 0.5], [0.0, -2.0]]" in text
     if not words:
         path.write_text(text.replace("# A = [[-1.0, 0.5]", "A = [[-1.0, 0.25]"))
-        assert cli.main(["validate", str(path)]) == 0
-        assert "each parameter of the task has an effect" in capsys.readouterr().out
+        out = ran("validate", path)
+        assert "each parameter of the task has an effect" in out
         env = fmugym.load(path)
         env.reset()
         env.step(env.action_space.sample())

@@ -1,9 +1,9 @@
 """Without the C extension FMPy steps FMUs, and what needs the extension says so."""
 
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
+
+from process_tools import run_python
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = """
@@ -31,9 +31,7 @@ for refused in (
 
 
 def test_the_slow_path_works_and_says_so_once():
-    result = subprocess.run(
-        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
-    )
+    result = run_python("-c", PROGRAM, check=True)
     assert result.stdout.count("FMUs are stepped by FMPy, which is slow") == 1
     assert "Python's headers were missing. Install them" in result.stdout
     refusals = [line for line in result.stdout.splitlines() if line.startswith("refused: ")]
@@ -51,8 +49,7 @@ def test_without_the_headers_of_python_a_wheel_is_built(tmp_path):
     script = "import sysconfig; sysconfig.get_config_vars()['installed_base'] = '/nowhere'\n"
     script += "import build_backend\nassert build_backend.get_requires_for_build_wheel() == []\n"
     script += f"build_backend.build_wheel({str(tmp_path)!r})"
-    command = [sys.executable, "-c", script]
-    result = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
+    result = run_python("-c", script, cwd=copy)
     assert result.returncode == 0, result.stderr
     (wheel,) = tmp_path.glob("*-none-any.whl")
     names = zipfile.ZipFile(wheel).namelist()

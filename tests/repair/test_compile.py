@@ -16,7 +16,6 @@ from source_tools import BOTH, build_description, write_source_fmu
 from fmugym import FMU, FMULoadError
 from fmugym.pool import PoolSpec
 from fmugym.repair.compiling import compile_fmu
-from fmugym.tools.cli import main
 from fmugym.trial import opening
 
 
@@ -45,13 +44,11 @@ class TestCompile:
         )
         assert fmu_tools.read_fmu(made).keys() > fmu_tools.read_fmu(source_fmu(version)).keys()
 
-    def test_the_command(self, source_fmu, capsys):
+    def test_the_command(self, source_fmu, refused, ran):
         path = source_fmu(3)
-        assert main(["info", "--repair", str(path), "--json"]) == 0
-        made = json.loads(capsys.readouterr().out)["output"]
+        made = json.loads(ran("info", "--repair", path, "--json"))["output"]
         assert fmpy.platform_tuple in made
-        assert main(["info", "--repair", str(path)]) == 1
-        assert "exists" in capsys.readouterr().err
+        assert "exists" in refused("info", "--repair", path)
 
 
 class TestRefusals:

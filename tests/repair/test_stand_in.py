@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tomllib
 
-import building
 import pytest
 from combinations import in_turn
 from fmu_tools import HERE, edited_fmu, library_name
@@ -18,7 +17,6 @@ from fmugym import FMU, ConfigError, Task, extras
 from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
 from fmugym.archive.loader import ask
 from fmugym.repair import stand_in
-from fmugym.tools.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
 DOCUMENT = HERE.parent / "docs" / "foreign-fmus.md"
@@ -56,8 +54,6 @@ def fmu_path(request, probe, tmp_path_factory):
 def play(fmu_path, environment=(), **config):
     """Play some steps in a process of its own, after a trial; returns what came of it."""
     script = f"""
-import sys
-sys.path[:0] = {building.FOLDERS!r}
 import fmugym
 from fmu_tools import PlainEnv, probe_config
 try:
@@ -71,9 +67,8 @@ try:
 except fmugym.FMULoadError as error:
     print(error)
 """
-    variables = {**os.environ, "FMUGYM_PROBE": "on", **dict(environment)}
-    command = [sys.executable, "-W", "error", "-c", script]
-    done = subprocess.run(command, capture_output=True, text=True, env=variables, timeout=120)
+    variables = {"FMUGYM_PROBE": "on", **dict(environment)}
+    done = run_python("-W", "error", "-c", script, environment=variables)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip().splitlines()[-1]
 
@@ -98,15 +93,14 @@ def compiler(request, monkeypatch):
     },
     indirect=["fmu_path", "compiler"],
 )
-def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, capsys):
+def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, ran):
     (name,) = stand_in.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
     (command,) = re.findall(
         r"^fmugym (info --repair model.fmu .* lib)$", DOCUMENT.read_text(), re.MULTILINE
     )
     replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
-    assert main([replaced.get(word, word) for word in command.split()]) == 0
-    said = capsys.readouterr().out
+    said = ran(*[replaced.get(word, word) for word in command.split()])
     assert "without _gfortran_matmul_r8" in said
     preload = [str(tmp_path / name)]
     assert f'"foreign": {{"preload": {json.dumps(preload)}}}' in said
@@ -126,48 +120,43 @@ def test_what_the_stand_in_lacks_ends_the_trial_with_its_name(fmu_path, tmp_path
     assert "has no function _gfortran_matmul_r8, which the FMU calls" in said
 
 
-def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, capsys):
+def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, cli, ran):
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))  # nobody has met it
-    assert main(["info", str(fmu_path)]) == 0
+    out = ran("info", fmu_path)
     (name,) = FMU(fmu_path).missing_libraries
-    out = capsys.readouterr().out
     assert (
         f"does NOT run here: Probe.fmu needs shared libraries that are not found here: {name}"
         in out
     )
     assert "'fmugym info --repair FMU' makes a replacement" in out
     assert "runs here\n" not in out
-    assert main(["info", str(fmu_path), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = json.loads(ran("info", fmu_path, "--json"))
     assert facts["runs_here"] is False
     assert [row["name"] for row in facts["missing_libraries"]] == [name]
-    assert main(["new", "--class", str(fmu_path)]) == 0
-    assert (
-        "does not run on this machine: Probe.fmu needs shared libraries" in capsys.readouterr().err
-    )
+    code, _, err = cli("new", "--class", fmu_path)
+    assert code == 0
+    assert "does not run on this machine: Probe.fmu needs shared libraries" in err
 
 
-def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatch, capsys):
+def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatch, ran):
     """From the FMU to an episode: ``new`` names the library, once it is there in earnest."""
     (name,) = FMU(fmu_path).missing_libraries
     task = tmp_path / "task.toml"
-    assert main(["new", str(fmu_path), "--output", str(task)]) == 0
+    ran("new", fmu_path, "--output", task)
     assert (
         f"\n[foreign]\n# The FMU needs this: fmugym info --repair {fmu_path.name}"
         in task.read_text()
     )
     assert f'\n# preload = ["./{name}"]' in task.read_text()
-    assert main(["info", "--repair", str(fmu_path), "--output", str(tmp_path)]) == 0
+    ran("info", "--repair", fmu_path, "--output", tmp_path)
     task.unlink()
-    assert main(["new", str(fmu_path), "--output", str(task)]) == 0
+    ran("new", fmu_path, "--output", task)
     assert f'\npreload = ["./{name}"]' in task.read_text()
     monkeypatch.setenv("FMUGYM_PROBE", "on")
     # not in this process, which may have loaded another library of that name
-    played = run_python("-m", "fmugym", "simulate", str(task), "--steps", "2")
+    played = run_python("-m", "fmugym", "simulate", task, "--steps", 2)
     assert played.returncode == 0, played.stderr
-    capsys.readouterr()
-    assert main(["info", str(task)]) == 0
-    said = capsys.readouterr().out
+    said = ran("info", task)
     assert "linux64: runs here" in said
     assert "reset is right" in said
     Task.read(task).write(tmp_path / "copy.toml")
@@ -176,12 +165,11 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
     ]
 
 
-def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, capsys):
+def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, ran):
     (name,) = FMU(fmu_path).missing_libraries
     (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
     assert play(fmu_path, preload=[str(built.path)]) == STEPPED
-    assert main(["info", str(fmu_path)]) == 0
-    said = capsys.readouterr().out
+    said = ran("info", fmu_path)
     assert "restore is right" in said
     assert "does NOT run here" not in said
     assert "has run here, but not like this: Probe.fmu needs" in said
@@ -189,24 +177,22 @@ def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path,
 
 
 def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(
-    fmu_path, probe, tmp_path, capsys
+    fmu_path, probe, tmp_path, refused
 ):
     with pytest.raises(ConfigError, match=r"Probe.fmu lacks neither libgfortran.so.3 nor"):
         stand_in.build_stand_in(FMU(probe()), tmp_path)
     (name,) = FMU(fmu_path).missing_libraries
     (tmp_path / name).write_text("precious")
-    assert main(["info", "--repair", str(fmu_path), "--output", str(tmp_path)]) == 1
-    assert "exists already" in capsys.readouterr().err
+    assert "exists already" in refused("info", "--repair", fmu_path, "--output", tmp_path)
     assert (tmp_path / name).read_text() == "precious"
 
 
-def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
+def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, ran):
     """By default to the working directory; the path in ``preload`` holds elsewhere, too."""
     (name,) = FMU(fmu_path).missing_libraries
     monkeypatch.chdir(tmp_path)
-    assert main(["info", "--repair", str(fmu_path)]) == 0
-    assert f'preload = ["{tmp_path / name}"]' in capsys.readouterr().out
-    assert main(["stand-in", str(fmu_path), "--folder", "a/b"]) == 0
+    assert f'preload = ["{tmp_path / name}"]' in ran("info", "--repair", fmu_path)
+    ran("stand-in", fmu_path, "--folder", "a/b")
     assert (tmp_path / "a" / "b" / name).is_file()
     with pytest.raises(ConfigError, match="cannot hold libraries"):
         stand_in.build_stand_in(FMU(fmu_path), tmp_path / name / "inside")

@@ -63,13 +63,6 @@ def made(separable=False, seed=0, population=12, **limits):
         return CMA(np.zeros(6), 0.5, population, np.random.default_rng(seed), **limits)
 
 
-def minimized(function, rounds, separable=False):
-    cma = made(separable)
-    for _ in range(rounds):
-        cma.tell(np.argsort(function(cma.ask())))
-    return cma
-
-
 class Other:
     """The implementation of the package ``cmaes``, with the methods of ours."""
 
@@ -166,11 +159,6 @@ class TestCMA:
         log = np.log(3.5) - np.log([1, 2, 3])
         assert cma.mean == pytest.approx(log / log.sum() @ points[[3, 1, 2]], rel=1e-12)
 
-    def test_only_the_order_counts(self):
-        """Not how much better a candidate is."""
-        logarithm = minimized(lambda points: np.log(1e-300 + rosenbrock(points)), 50)
-        assert minimized(rosenbrock, 50).mean.tolist() == logarithm.mean.tolist()
-
 
 def rounds_of(function, cma):
     """How many rounds it takes until one candidate is as good as the minimum."""
@@ -224,6 +212,12 @@ def load(document=FALLING, **changes):
     return partial(fmugym.load, fmugym.Task.from_dict(task))
 
 
+@pytest.fixture
+def env():
+    with closing(load()()) as found:
+        yield found
+
+
 def pid(rows):
     return PID("theta", 0.0, kp=rows[:, 0], td=0.2)
 
@@ -238,22 +232,21 @@ def played(make_env, make=pid, numbers=GAINS, seeds=SEEDS, **arguments):
 
 
 class TestArena:
-    def test_its_results_are_those_of_single_environments(self):
+    def test_its_results_are_those_of_single_environments(self, env):
         costs = ["turns", "effort"]
         outcome, _ = played(load(), limits=dict.fromkeys(costs, 1.0))
         assert outcome.returns.shape == (5, 3)
         assert outcome.costs.shape == (5, 3, 3)
         assert not outcome.costs[..., 2].any()  # no faults
         lengths = set()
-        with closing(load()()) as env:
-            for row, (gain,) in enumerate(GAINS):
-                controller = PID("theta", 0.0, kp=gain, td=0.2).bind(env)
-                for column, seed in enumerate(SEEDS):
-                    controller.reset()
-                    total, cost, length = episode(env, controller, seed, costs)
-                    lengths.add(length)
-                    assert outcome.returns[row, column] == total
-                    assert outcome.costs[row, column, :2].tolist() == cost
+        for row, (gain,) in enumerate(GAINS):
+            controller = PID("theta", 0.0, kp=gain, td=0.2).bind(env)
+            for column, seed in enumerate(SEEDS):
+                controller.reset()
+                total, cost, length = episode(env, controller, seed, costs)
+                lengths.add(length)
+                assert outcome.returns[row, column] == total
+                assert outcome.costs[row, column, :2].tolist() == cost
         assert len(lengths) > 3  # some have ended before others
 
     def test_environments_are_not_opened_again_and_again(self):
@@ -493,11 +486,10 @@ def policy_with(form, env_of_one, seed=0, rows=None, baseline=None):
 
 
 class TestPolicy:
-    def test_without_weights_it_is_the_controller(self):
-        with closing(load()()) as env:
-            policy, controller = Policy(pid(GAINS[3:4])).bind(env), pid(GAINS[3:4]).bind(env)
-            assert episode(env, policy, 4) == episode(env, controller, 4)
-            assert Policy(None).bind(env).act(np.zeros(2)) == 0.0
+    def test_without_weights_it_is_the_controller(self, env):
+        policy, controller = Policy(pid(GAINS[3:4])).bind(env), pid(GAINS[3:4]).bind(env)
+        assert episode(env, policy, 4) == episode(env, controller, 4)
+        assert Policy(None).bind(env).act(np.zeros(2)) == 0.0
 
     def test_corrections_are_halves_of_the_range_and_end_at_its_limits(self):
         env = Stub(NUMBERS, ACTING[0])
@@ -730,7 +722,7 @@ def test_a_process_that_constants_drive_away_can_be_controlled(tmp_path):
     assert search.ahead.merit[1] > 1.7 * by_feedback
 
 
-def test_a_scale_is_that_of_all_features():
+def test_a_scale_is_that_of_all_features(env):
     """Of the steps of all episodes until their ends, whatever plays beside them."""
     observed = []
     form = Agent("own", None, 2, 1, history=True)
@@ -743,13 +735,12 @@ def test_a_scale_is_that_of_all_features():
             moments = arena.play(make, rows, SEEDS, has_moments=True).moments.sum(axis=(0, 1))
             scales.append(scale_of(moments))
     assert np.array_equal(*scales)
-    with closing(load()()) as env:
-        for weights in rows:
-            policy = make(weights).bind(env)
-            policy._network = recording(policy._network, observed)
-            for seed in SEEDS:
-                policy.reset()
-                episode(env, policy, seed)
+    for weights in rows:
+        policy = make(weights).bind(env)
+        policy._network = recording(policy._network, observed)
+        for seed in SEEDS:
+            policy.reset()
+            episode(env, policy, seed)
     features = np.concatenate(observed)
     assert len(features) == moments[0] < 40 * 12
     expected = np.stack([features.mean(axis=0), features.std(axis=0)])
@@ -932,9 +923,8 @@ class TestAgent:
     NAMES = "theta", "theta_dot"
 
     @pytest.fixture(params=FORMS, ids=lambda form: form.name)
-    def agent(self, request):
-        with closing(load()()) as env:
-            policy, space = policy_with(request.param, env), str(env.action_space)
+    def agent(self, request, env):
+        policy, space = policy_with(request.param, env), str(env.action_space)
         text = "pid of=theta setpoint=0 kp=0.2 td=0.2"
         return replace(policy.agent, text=text, names=self.NAMES, actions=space)
 
@@ -991,11 +981,10 @@ class TestAgent:
             (NAMES, "Discrete(2)", ["Discrete(2)", "Box(-0.1, 0.1"]),
         ],
     )
-    def test_another_task_is_told_by_what_differs(self, names, actions, facts):
-        with closing(load()()) as env:
-            agent = Agent("own", None, names=names, actions=actions or str(env.action_space))
-            with pytest.raises(ConfigError, match="another task") as caught:
-                agent.policy().bind(env)
+    def test_another_task_is_told_by_what_differs(self, names, actions, facts, env):
+        agent = Agent("own", None, names=names, actions=actions or str(env.action_space))
+        with pytest.raises(ConfigError, match="another task") as caught:
+            agent.policy().bind(env)
         for fact in facts:
             assert fact in str(caught.value)
 
@@ -1136,6 +1125,11 @@ def content(folder):
     return (folder / AGENT).read_bytes()
 
 
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "agent"
+
+
 @pytest.fixture(scope="module")
 def usual(tmp_path_factory):
     """The folder of a search, and its facts."""
@@ -1158,35 +1152,32 @@ class TestSearch:
         assert "chance" not in facts["verdict"]
         assert facts["rounds"] == ROUNDS
 
-    def test_its_agent_reaches_what_it_tells(self, usual):
+    def test_its_agent_reaches_what_it_tells(self, usual, env):
         """In single environments, by the file alone."""
         folder, facts = usual
         told = rewards(facts, facts["agent"])
-        with closing(load()()) as env:
-            policy = Agent.load(folder).policy().bind(env)
-            for seed, expected in enumerate(told, HELD_OUT_SEED):
-                policy.reset()
-                assert episode(env, policy, seed)[0] == expected
+        policy = Agent.load(folder).policy().bind(env)
+        for seed, expected in enumerate(told, HELD_OUT_SEED):
+            policy.reset()
+            assert episode(env, policy, seed)[0] == expected
 
-    def test_the_same_rounds_give_the_same_agent_with_one_thread(
-        self, usual, tmp_path, monkeypatch
-    ):
+    def test_the_same_rounds_give_the_same_agent_with_one_thread(self, usual, folder, monkeypatch):
         monkeypatch.setattr("fmugym.pool.native.available_processors", lambda: 1)
-        searched(tmp_path / "agent")
-        assert content(tmp_path / "agent") == content(usual[0])
+        searched(folder)
+        assert content(folder) == content(usual[0])
 
-    def test_another_seed_gives_another_agent(self, usual, tmp_path):
-        searched(tmp_path / "agent", seed=1)
-        assert content(tmp_path / "agent") != content(usual[0])
+    def test_another_seed_gives_another_agent(self, usual, folder):
+        searched(folder, seed=1)
+        assert content(folder) != content(usual[0])
 
-    def test_training_validation_and_test_never_share_episodes(self, tmp_path, monkeypatch):
+    def test_training_validation_and_test_never_share_episodes(self, folder, monkeypatch):
         calls, play = [], Arena.play
         monkeypatch.setattr(
             Arena,
             "play",
             lambda arena, *rest, **more: calls.append(rest) or play(arena, *rest, **more),
         )
-        searched(tmp_path / "agent")
+        searched(folder)
         _, *calls = calls  # the first one was a look at the task
         several = [(len(numbers), list(seeds)) for _, numbers, seeds, *_ in calls]
         training = {seed for count, seeds in several if count > 2 for seed in seeds}
@@ -1199,7 +1190,7 @@ class TestSearch:
         firsts = [min(seeds) for count, seeds in several if count <= 2]
         assert firsts == sorted(firsts)  # the test is played once, at the end
 
-    def test_equal_episodes_are_played_once(self, tmp_path, monkeypatch):
+    def test_equal_episodes_are_played_once(self, folder, monkeypatch):
         counts, told, play = [], [], Arena.play
 
         def spy(arena, make, numbers, seeds, **options):
@@ -1208,45 +1199,45 @@ class TestSearch:
 
         monkeypatch.setattr(Arena, "play", spy)
         parameters = {"q_0": "pi", "theta_0": 0.5}
-        facts = searched(tmp_path / "agent", parameters=parameters, told=told)
+        facts = searched(folder, parameters=parameters, told=told)
         assert counts[0] > 1  # how it knows, and how quick a step is
         assert set(counts[2:]) == {1}
         assert any("one episode" in line for line in told)
         assert len(rewards(facts, facts["agent"])) == 1
 
-    def test_a_baseline_that_cannot_be_beaten_stays(self, tmp_path):
+    def test_a_baseline_that_cannot_be_beaten_stays(self, folder):
         told = []
         best = {"best": "schedule 00:00=0.05", "lazy": "schedule 00:00=0"}
-        facts = searched(tmp_path / "agent", reward="-abs(tau - 0.05)", controllers=best, told=told)
+        facts = searched(folder, reward="-abs(tau - 0.05)", controllers=best, told=told)
         assert facts["agent"] == facts["baseline"] == next(iter(facts["test"])) == "best"
         assert [line for line in told if "nothing was found that beats best" in line]
-        agent = Agent.load(tmp_path / "agent")
+        agent = Agent.load(folder)
         assert (agent.text, agent.acting) == ("schedule 00:00=0.05", 0)
 
-    def test_limits_of_costs_are_kept(self, tmp_path):
+    def test_limits_of_costs_are_kept(self, folder):
         """The most torque is best, and half of it is allowed: 40 steps of 0.05 Nm."""
         costs = {"effort": {"expr": "abs(tau)", "limit": 2.0}}
         changes = {"reward": "tau", "costs": costs, "controllers": None, "terminated": None}
-        facts = searched(tmp_path / "agent", rounds=60, **changes)
+        facts = searched(folder, rounds=60, **changes)
         reached = facts["test"][facts["agent"]]
         assert reached["mean_costs"]["effort"] <= 2.0
         assert reached["total_reward"] > 1.8
         assert "of at most 2" in facts["verdict"]
 
-    def test_without_controllers_guesses_are_tuned(self, tmp_path):
+    def test_without_controllers_guesses_are_tuned(self, folder):
         told = []
         guessed = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
-        facts = searched(tmp_path / "agent", rounds=32, **guessed)
+        facts = searched(folder, rounds=32, **guessed)
         assert "PI (to be tuned)" in told[0]
         assert facts["baseline"] == "tuned PI"
 
-    def test_without_any_constant_actions_are_tuned(self, tmp_path):
+    def test_without_any_constant_actions_are_tuned(self, folder):
         told = []
-        facts = searched(tmp_path / "agent", controllers=None, told=told, rounds=8)
+        facts = searched(folder, controllers=None, told=told, rounds=8)
         assert "constant action" in told[0]
         assert facts["baseline"] == "constant action"
 
-    def test_controllers_of_one_action_do_not_act_on_two(self, tmp_path):
+    def test_controllers_of_one_action_do_not_act_on_two(self, folder):
         """A warm-up may need them all the same."""
         told = []
         two = {
@@ -1255,23 +1246,23 @@ class TestSearch:
             "controllers": CONTROLLERS | {"still": 0},
             "warm_up": {"period": "50ms", "controller": {"tau": "lazy"}},
         }
-        facts = searched(tmp_path / "agent", **two, told=told, rounds=8)
+        facts = searched(folder, **two, told=told, rounds=8)
         assert told[0] == "left out: lazy, pi, still: there are several actions, and each gives one"
         assert facts["baseline"] == "constant action"
 
-    def test_few_rounds_give_what_they_have_come_to(self, tmp_path):
+    def test_few_rounds_give_what_they_have_come_to(self, folder):
         """Also before the first validation."""
         one = {"pi": CONTROLLERS["pi"]}
-        facts = searched(tmp_path / "agent", rounds=3, controllers=one)
+        facts = searched(folder, rounds=3, controllers=one)
         assert facts["agent"] == facts["baseline"] == "tuned pi"
         assert facts["rounds"] == 3
-        assert Agent.load(tmp_path / "agent").text.startswith("pid of=theta")
+        assert Agent.load(folder).text.startswith("pid of=theta")
 
-    def test_few_rounds_find_no_less_than_what_is_there(self, tmp_path):
+    def test_few_rounds_find_no_less_than_what_is_there(self, folder):
         """A controller that is ready takes part from the beginning."""
         good = {"best": "schedule 00:00=0.05", "pi": CONTROLLERS["pi"]}
         changes = {"reward": "-abs(tau - 0.05)", "controllers": good}
-        facts = searched(tmp_path / "agent", rounds=6, **changes)
+        facts = searched(folder, rounds=6, **changes)
         assert facts["agent"] == "best"
 
 
@@ -1300,10 +1291,10 @@ class Budget:
 class TestBudget:
     @pytest.mark.parametrize("envs", [512, 11])
     @pytest.mark.parametrize("ceiling", [5_000, 40_000])
-    def test_steps_are_a_ceiling_of_all_but_the_test(self, ceiling, envs, tmp_path, monkeypatch):
+    def test_steps_are_a_ceiling_of_all_but_the_test(self, ceiling, envs, folder, monkeypatch):
         budget = Budget(monkeypatch)
         limits = {"rounds": np.inf, "minutes": 60, "steps": ceiling, "envs": envs}
-        facts = searched(tmp_path / "agent", **limits)
+        facts = searched(folder, **limits)
         assert 0.7 * ceiling < facts["steps"] <= ceiling
         assert 0 <= facts["steps"] - budget.steps < MOST_PROBED
 
@@ -1321,12 +1312,12 @@ class TestBudget:
             facts.append(searched(folder, **limits) | {"steps": None})
         assert facts[0] == facts[1] == facts[2]
 
-    def test_a_ceiling_below_a_look_at_the_task_is_refused(self, tmp_path, monkeypatch):
+    def test_a_ceiling_below_a_look_at_the_task_is_refused(self, folder, monkeypatch):
         budget = Budget(monkeypatch)
         with pytest.raises(ConfigError, match=f"{MOST_PROBED} steps.*{MOST_PROBED}"):
-            searched(tmp_path / "agent", steps=MOST_PROBED)
+            searched(folder, steps=MOST_PROBED)
         assert budget.steps == 0
-        assert not (tmp_path / "agent").exists()
+        assert not (folder).exists()
 
     @pytest.mark.parametrize("seconds", [2.0, 5.0])
     def test_minutes_are_the_time_of_all_but_the_test(self, seconds, tmp_path, monkeypatch):
@@ -1392,11 +1383,11 @@ class TestProbe:
         probe = Probe.of(load(terminated=None, episode_length="10s"), 8, print)
         assert probe.round_time(1) == pytest.approx(probe.seconds * 200 * 8)
 
-    def test_a_reward_that_is_always_nan_is_refused(self, tmp_path):
+    def test_a_reward_that_is_always_nan_is_refused(self, folder):
         reward = {"fine": "-theta**2", "wrong": "log(-1 - tau**2)"}
         with pytest.raises(ConfigError, match=r"reward\.wrong.*log\(-1 - tau\*\*2\).*validate"):
-            searched(tmp_path / "agent", reward=reward)
-        assert not (tmp_path / "agent").exists()
+            searched(folder, reward=reward)
+        assert not (folder).exists()
 
     def test_a_reward_that_is_nan_later_is_none_of_its_business(self):
         Probe.of(load(reward="log(1.5 - n)", memory=COUNTED), 8, print)

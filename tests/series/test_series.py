@@ -17,7 +17,6 @@ from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, wr
 from fmugym.series.plots import as_svg
 from fmugym.series.rows import Infos
 from fmugym.task.quantity import Quantity
-from fmugym.vector import FMUVectorEnv
 
 TASK = {
     "fmu": {"bundled": "Pendulum"},
@@ -45,6 +44,16 @@ def make():
     return fmugym.load(TASK)
 
 
+@pytest.fixture
+def record(opened):
+    """Record environments until the end of the test."""
+
+    def begin(*arguments, task=TASK, **options):
+        return opened(RecordSeries(fmugym.load(task), *arguments, **options))
+
+    return begin
+
+
 def played(env, seed, steps):
     """Play episodes with actions from one stream; return what the steps give."""
     env.action_space.seed(7)
@@ -57,8 +66,8 @@ def played(env, seed, steps):
 
 
 class TestSingle:
-    def test_rows_are_what_the_environment_gives(self):
-        env, twin = RecordSeries(make()), make()
+    def test_rows_are_what_the_environment_gives(self, record, load):
+        env, twin = record(), load(TASK)
         results = played(env, 3, 20)
         series = env.series
         assert len(series) == len(results)
@@ -89,11 +98,9 @@ class TestSingle:
         ends = [len(result) == 5 and result[3] for result in results]
         assert series["truncated"].tolist() == ends
         assert series.cost_limits == {"fast": 3}
-        env.close()
-        twin.close()
 
-    def test_units_kinds_and_limits(self):
-        env = RecordSeries(make())
+    def test_units_kinds_and_limits(self, record):
+        env = record()
         env.reset(seed=0)
         found = {column.name: column for column in env.series.columns}
         assert found["angle"].unit == "deg"
@@ -102,30 +109,24 @@ class TestSingle:
         assert [c.name for c in env.series.of_kind("action")] == ["tau", "gain"]
         assert found["tau"].unit == "N.m"
         assert "q_0" not in found
-        env.close()
 
-    def test_a_setpoint_has_the_unit_of_its_variable(self):
-        env = RecordSeries(make())
+    def test_a_setpoint_has_the_unit_of_its_variable(self, record):
+        env = record()
         env.reset(seed=0)
         (setpoint,) = env.series.of_kind("setpoint")
         assert (setpoint.of, setpoint.unit, setpoint.holds) == ("angle", "deg", True)
-        env.close()
-        env = RecordSeries(
-            fmugym.load(
-                {
-                    "fmu": {"bundled": "Pendulum"},
-                    "agent": {"actions": "tau", "observations": ["q", "q_dot"]},
-                    "setpoints": {"goal": {"value": 1, "of": "q_dot"}},
-                    "reward": "-abs(q)",
-                }
-            )
-        )
+        task = {
+            "fmu": {"bundled": "Pendulum"},
+            "agent": {"actions": "tau", "observations": ["q", "q_dot"]},
+            "setpoints": {"goal": {"value": 1, "of": "q_dot"}},
+            "reward": "-abs(q)",
+        }
+        env = record(task=task)
         env.reset(seed=0)
         assert [one.of for one in env.series.of_kind("setpoint")] == ["q_dot"]
-        env.close()
 
-    def test_globs_choose_variables(self):
-        env = RecordSeries(make(), ["a*", "theta*", "q_0", "m", "observation.q?dot"])
+    def test_globs_choose_variables(self, record):
+        env = record(["a*", "theta*", "q_0", "m", "observation.q?dot"])
         observation, _ = env.reset(seed=0)
         names = [c.name for c in env.series.columns]
         kept = names[names.index("time") + 1 : names.index("reward")]
@@ -137,31 +138,27 @@ class TestSingle:
         found = env.unwrapped.read_variables("theta", "m")
         assert env.series["theta"][0] == found["theta"]
         assert env.series["m"][0] == found["m"]
-        env.close()
 
-    def test_the_rows_of_compiled_steps(self):
+    def test_the_rows_of_compiled_steps(self, load):
         config = TASK | {"episode_length": "1s"}
-        compiled = RecordSeries(fmugym.load(config, hooks="compiled"))
-        plain = RecordSeries(fmugym.load(config, hooks="python"))
+        compiled = RecordSeries(load(config, hooks="compiled"))
+        plain = RecordSeries(load(config, hooks="python"))
         for env in (compiled, plain):
             played(env, 1, 60)
             env.step(np.array([0.01, 0.5], np.float32))
         assert compiled.unwrapped.inside.player is not None
         assert np.array_equal(compiled.series.values, plain.series.values)
-        compiled.close()
-        plain.close()
 
-    def test_a_class_without_a_task_file(self):
-        env = RecordSeries(gymnasium.make("fmugym/CartPole-v0"))
+    def test_a_class_without_a_task_file(self, opened):
+        env = opened(RecordSeries(gymnasium.make("fmugym/CartPole-v0")))
         results = played(env, 0, 50)
         names = [column.name for column in env.series.columns]
         assert names[2:8] == ["time", "f", "x", "x_dot", "phi", "phi_dot"]
         assert env.series["phi"].astype(np.float32).tolist() == [r[0][2] for r in results]
         assert env.series.units["phi"] == "rad"
-        env.close()
 
-    def test_at_a_rate_sums_stay_right(self):
-        whole, part = RecordSeries(make()), RecordSeries(make(), every=0.25)
+    def test_at_a_rate_sums_stay_right(self, record):
+        whole, part = record(), record(every=0.25)
         for env in (whole, part):
             played(env, 3, 30)
         assert part.series["step"].tolist()[:5] == [0, 5, 10, 12, 0]
@@ -171,14 +168,11 @@ class TestSingle:
                 last = np.isin(other["step"], np.arange(one["step"][-1] + 1))
                 assert one[name].sum() == pytest.approx(other[name][last].sum())
         assert part.series["angle"][1] == whole.series["angle"][5]
-        whole.close()
-        part.close()
 
-    def test_a_fault_has_its_reason(self):
-        env = RecordSeries(fmugym.load(TASK | {"reward": "1 / (step - 3)"}))
+    def test_a_fault_has_its_reason(self, record):
+        env = record(task=TASK | {"reward": "1 / (step - 3)"})
         results = played(env, 0, 4)
         assert env.series.faults == {3: results[3][4]["fault"]}
-        env.close()
 
     @pytest.mark.parametrize(
         ("arguments", "fact"),
@@ -189,26 +183,24 @@ class TestSingle:
             ({"path": "run.xls"}, "run.xls"),
         ],
     )
-    def test_mistakes(self, arguments, fact, tmp_path):
+    def test_mistakes(self, arguments, fact, tmp_path, load):
         if "path" in arguments:
             arguments = {"path": tmp_path / arguments["path"]}
-        env = make()
+        env = load(TASK)
         with pytest.raises(ConfigError, match=re.escape(fact)):
             RecordSeries(env, **arguments).reset()
-        env.close()
 
-    def test_other_environments_are_refused(self):
+    def test_other_environments_are_refused(self, record):
         with pytest.raises(ConfigError):
             RecordSeries(gymnasium.make("CartPole-v1"))
-        env = RecordSeries(make())
+        env = record()
         with pytest.raises(fmugym.SimulationError):
             _ = env.series
-        env.close()
 
 
 @in_turn({"hooks": ["compiled", "array", "per_env"], "mode": ["next_step", "same_step"]})
-def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode):
-    envs = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode)
+def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode, record, make_envs):
+    envs = make_envs(make, 3, hooks=hooks, autoreset_mode=mode)
     wanted = ["*", "observation.*"]
     many = RecordVectorSeries(envs, wanted, environments=[0, 2])
     many.action_space.seed(5)
@@ -217,7 +209,7 @@ def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode):
     for action in actions:
         many.step(action)
     for index in (0, 2):
-        one = RecordSeries(make(), wanted)
+        one = record(wanted)
         one.reset(seed=9 + index)
         ended = False
         for action in actions:
@@ -232,14 +224,12 @@ def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode):
         expected = one.series.values.copy()
         assert one.series["truncated"].sum() >= 2
         assert np.array_equal(rows, expected, equal_nan=True)
-        one.close()
     assert set(many.series["environment"]) == {0, 2}
-    many.close()
 
 
-def driven(mode, begins):
+def driven(make_envs, mode, begins):
     """Everything that 30 steps of three environments return, and a recording from a step on."""
-    envs = FMUVectorEnv(make, 3, autoreset_mode=mode)
+    envs = make_envs(make, 3, autoreset_mode=mode)
     envs.action_space.seed(5)
     used = RecordVectorSeries(envs) if begins == 0 else envs
     used.reset(seed=9)
@@ -248,34 +238,32 @@ def driven(mode, begins):
         if number == begins > 0:
             used = RecordVectorSeries(envs)
         told += used.step(envs.action_space.sample())[:4]
-    used.close()
     return np.concatenate(told, None), used.series
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-def test_a_recorder_changes_nothing_and_may_begin_late(mode):
-    results, whole = driven(mode, 0)
+def test_a_recorder_changes_nothing_and_may_begin_late(mode, make_envs):
+    results, whole = driven(make_envs, mode, 0)
     assert whole["truncated"].sum() > 3
     for begins in (1, 5):  # in the first episodes
-        same, late = driven(mode, begins)
+        same, late = driven(make_envs, mode, begins)
         assert np.array_equal(results, same)
         missing = 3 * (begins + 1)  # the resets and the steps before
         kept = [column.name != "episode" for column in whole.columns]
         assert np.array_equal(whole.values[missing:, kept], late.values[:, kept], equal_nan=True)
 
 
-def test_a_recorder_of_one_environment_may_begin_late():
-    env = make()
+def test_a_recorder_of_one_environment_may_begin_late(load):
+    env = load(TASK)
     env.reset(seed=3)
     env.step(env.action_space.sample())
     late = RecordSeries(env)
     late.step(env.action_space.sample())
     assert late.series["step"].tolist() == [2]
-    late.close()
 
 
-def test_steps_in_the_background_and_masked_resets():
-    envs = FMUVectorEnv(make, 2, autoreset_mode="disabled")
+def test_steps_in_the_background_and_masked_resets(make_envs):
+    envs = make_envs(make, 2, autoreset_mode="disabled")
     many = RecordVectorSeries(envs, "angle")
     many.reset(seed=0)
     action = many.action_space.sample()
@@ -287,7 +275,6 @@ def test_steps_in_the_background_and_masked_resets():
     assert many.series["episode"].tolist() == [0, 0, 0, 0, 1]
     with pytest.raises(ConfigError, match="0 to 1"):
         RecordVectorSeries(envs, environments=[2])
-    many.close()
 
 
 def play_until_an_error(env):
@@ -298,8 +285,8 @@ def play_until_an_error(env):
 
 
 class TestFiles:
-    def test_a_csv_file_has_units_and_exact_numbers(self, tmp_path):
-        env = RecordSeries(make(), ["angle", "T_set"], path=tmp_path / "a.csv")
+    def test_a_csv_file_has_units_and_exact_numbers(self, tmp_path, record):
+        env = record(["angle", "T_set"], path=tmp_path / "a.csv")
         played(env, 0, 15)
         env.close()
         with (tmp_path / "a.csv").open(newline="") as file:
@@ -348,11 +335,11 @@ class TestFiles:
             inner.close()
 
     @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no size of files")
-    def test_a_full_disk_names_the_file(self, tmp_path):
+    def test_a_full_disk_names_the_file(self, tmp_path, record):
         import resource
 
         path, limits = tmp_path / "a.csv", resource.getrlimit(resource.RLIMIT_FSIZE)
-        env = RecordSeries(make(), "angle", path=path)
+        env = record("angle", path=path)
         env.reset(seed=0)
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
         try:
@@ -365,10 +352,10 @@ class TestFiles:
         env.close()
         assert path.stat().st_size == 4096
 
-    def test_a_parquet_file_has_units_and_can_be_read_again(self, tmp_path):
+    def test_a_parquet_file_has_units_and_can_be_read_again(self, tmp_path, record):
         parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")
         task = TASK | {"reward": "1 / (step - 3)"}
-        env = RecordSeries(fmugym.load(task), path=tmp_path / "a.parquet")
+        env = record(task=task, path=tmp_path / "a.parquet")
         played(env, 0, 20)
         env.close()
         table = parquet.read_table(tmp_path / "a.parquet")
@@ -382,36 +369,33 @@ class TestFiles:
         with pytest.raises(ConfigError, match=r"b\.parquet"):
             TimeSeries.read(tmp_path / "b.parquet")
 
-    def test_pandas(self):
+    def test_pandas(self, record):
         pytest.importorskip("pandas", reason="needs pandas: the extra pandas")
-        env = RecordSeries(make())
+        env = record()
         played(env, 0, 5)
         frame = env.series.to_pandas()
         assert frame["angle"].tolist() == env.series["angle"].tolist()
         assert frame["step"].dtype == np.int64
         assert frame.attrs["units"]["angle"] == "deg"
-        env.close()
 
     @pytest.mark.parametrize(("module", "extra"), [("pyarrow", "parquet"), ("pandas", "pandas")])
-    def test_a_missing_library_names_its_extra(self, module, extra, tmp_path, monkeypatch):
+    def test_a_missing_library_names_its_extra(self, module, extra, tmp_path, monkeypatch, record):
         monkeypatch.setitem(__import__("sys").modules, module, None)
-        env = RecordSeries(make())
+        env = record()
         env.reset(seed=0)
         with pytest.raises(ConfigError, match=f"'{extra}'"):
             env.series.to_pandas() if extra == "pandas" else env.series.write(
                 tmp_path / "a.parquet"
             )
-        env.close()
 
-    def test_memory_is_bounded(self, tmp_path):
-        env = RecordSeries(make(), "angle", most_rows=2_000, path=tmp_path / "a.csv")
+    def test_memory_is_bounded(self, tmp_path, record):
+        env = record("angle", most_rows=2_000, path=tmp_path / "a.csv")
         played(env, 0, 5_000)
         assert 2_000 <= len(env.series) <= 4_000
         with (tmp_path / "a.csv").open() as file:
             lines = sum(1 for _ in file)
         assert lines > 5_000
         assert env.series["episode"][-1] > 300
-        env.close()
 
 
 class Page(html.parser.HTMLParser):
@@ -441,11 +425,10 @@ class Page(html.parser.HTMLParser):
 
 
 @pytest.fixture
-def series():
+def series(record):
     pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
-    env = RecordSeries(make())
+    env = record()
     played(env, 0, 14)
-    env.close()
     return env.series
 
 
@@ -463,7 +446,7 @@ class TestPictures:
         limits = {line.get_ydata()[0] for line in action.get_lines()[1:]}
         assert limits == {-0.1, 0.1}
 
-    def test_two_set_points_are_the_edges_of_a_band(self):
+    def test_two_set_points_are_the_edges_of_a_band(self, record):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         task = {
             "fmu": {"bundled": "Pendulum"},
@@ -472,7 +455,7 @@ class TestPictures:
             "setpoints": {"least": -1, "most": {"value": 2}},
             "reward": "-max(least - q, 0) - max(q - most, 0)",
         }
-        env = RecordSeries(fmugym.load(task))
+        env = record(task=task)
         env.reset(seed=0)
         for _ in range(5):
             env.step(env.action_space.sample())
@@ -481,7 +464,6 @@ class TestPictures:
         heights = band.get_paths()[0].vertices[:, 1]
         assert (heights.min(), heights.max()) == (-1, 2)
         assert [line.get_label() for line in axis.get_lines()[:3]] == ["q", "least", "most"]
-        env.close()
 
     def test_files(self, series, tmp_path):
         (first, *_) = series.episodes().values()
@@ -492,10 +474,8 @@ class TestPictures:
         with pytest.raises(ConfigError, match="one episode"):
             plot(series)
 
-    def test_long_episodes_keep_their_extremes(self):
-        env = RecordSeries(
-            fmugym.load(TASK | {"episode_length": "1h", "terminated": False}), "angle"
-        )
+    def test_long_episodes_keep_their_extremes(self, record):
+        env = record("angle", task=TASK | {"episode_length": "1h", "terminated": False})
         env.reset(seed=0)
         for _ in range(10_000):
             env.step([0.1 * np.sin(env.unwrapped.time), 0])
@@ -505,7 +485,6 @@ class TestPictures:
         assert line.get_ydata().max() == first["angle"].max()
         assert line.get_ydata().min() == first["angle"].min()
         assert len(as_svg(first)) < 400_000
-        env.close()
 
 
 class TestReport:
@@ -574,12 +553,11 @@ class Bounded(fmugym.FMUEnv):
         return abs(self.state[0]) > 2
 
 
-def test_columns_of_a_class_have_the_bounds_of_its_config():
-    env = RecordSeries(Bounded(), ["f", "x", "theta", "phi_0", "start_time"])
+def test_columns_of_a_class_have_the_bounds_of_its_config(opened):
+    env = opened(RecordSeries(Bounded(), ["f", "x", "theta", "phi_0", "start_time"]))
     played(env, 0, 3)
     series = env.series
     limits = {one.name: (one.low, one.high) for one in series.columns}
     assert [limits[name] for name in ("f", "x", "phi_0")] == [(-2, 2.5), (-3, 3), (-0.5, 0.5)]
     assert limits["theta"] == (-np.inf, np.inf)
     assert series["start_time"].tolist() == [1.0] * 4
-    env.close()

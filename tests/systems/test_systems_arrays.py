@@ -23,7 +23,6 @@ from fmugym import (
     Uniform,
 )
 from fmugym.fmi import Status
-from fmugym.tools import cli
 
 PLANT = {
     "A": np.array([[0.0, 1.0], [-4.0, -0.4]]),
@@ -350,12 +349,11 @@ class TestFiles:
         assert env.out["plant.y[1]"] != 1.0
         env.close()
 
-    def test_info_and_new_tell_of_them(self, path, tmp_path, capsys):
+    def test_info_and_new_tell_of_them(self, path, tmp_path, ran):
         file = ssp_tools.write(plant_and_control(path), tmp_path / "s.ssp")
-        assert cli.main(["info", str(file)]) == 0
-        text = capsys.readouterr().out
+        text = ran("info", file)
         assert "plant.y -> control.u" in text
         assert "control.y[2] -> plant.u[2] (* 0.5 + 0.25)" in text
         own = ssp_tools.write(own_arrays(path), tmp_path / "own.ssp")
-        assert cli.main(["new", str(own), "--output", str(tmp_path / "own.toml")]) == 0
+        ran("new", own, "--output", tmp_path / "own.toml")
         assert "push[2]" in (tmp_path / "own.toml").read_text()

@@ -15,7 +15,6 @@ from system_tools import (
 from vector_tools import require_same_alone
 
 from fmugym import FMU, Component, ConfigError, FMUSystem
-from fmugym.tools import cli
 
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
 LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
@@ -139,9 +138,9 @@ class TestRefusals:
             FMUSystem({"c": Component(fmus["CoSimulation"], {"strike": 1})})
 
 
-def test_new_lists_them(fmus, tmp_path):
+def test_new_lists_them(fmus, tmp_path, ran):
     file = ssp_tools.write(FMUSystem({"c": fmus["CoSimulation"]}), tmp_path / "s.ssp")
-    assert cli.main(["new", str(file), "--output", str(tmp_path / "task.toml")]) == 0
+    ran("new", file, "--output", tmp_path / "task.toml")
     text = (tmp_path / "task.toml").read_text()
     assert '"c.strike"' in text
     assert '"c.constant"' not in text

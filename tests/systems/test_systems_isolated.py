@@ -36,7 +36,6 @@ from fmugym.pool.spec import ResetMethod
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import Component as Planned
 from fmugym.systems.system_plan import Connector, End, Link, Loop
-from fmugym.tools import cli
 from fmugym.wine.installation import can_run_windows
 
 MASSES = ["first.y1", "second.y2"]
@@ -337,7 +336,7 @@ class TestChoice:
             plan = pickle.loads(copy(made)).plan
         assert [component.isolate for component in plan.components] == [True, False]
 
-    def test_info_says_so(self, tmp_path, capsys):
+    def test_info_says_so(self, tmp_path, ran):
         task = tmp_path / "task.toml"
         task.write_text(
             """
@@ -357,8 +356,7 @@ class TestChoice:
             observations = ["theta"]
             """
         )
-        assert cli.main(["info", str(task)]) == 0
-        told = capsys.readouterr().out
+        told = ran("info", task)
         lines = [line for line in told.splitlines() if "Pendulum.fmu" in line]
         assert [("isolated" in line) for line in lines] == [True, False]
         assert "runs here, in worker processes" in told
@@ -389,10 +387,9 @@ class TestLibrariesForWindows:
         assert ["'a'" in obstacles[0], "'b'" in obstacles[1]] == [True, True]
         assert all("install Wine" in text for text in obstacles)
 
-    def test_info_says_so(self, windows, tmp_path, capsys):
+    def test_info_says_so(self, windows, tmp_path, ran):
         archive = ssp_tools.write(chain(windows), tmp_path / "chain.ssp")
-        assert cli.main(["info", str(archive)]) == 0
-        told = capsys.readouterr().out
+        told = ran("info", archive)
         assert "does NOT run here" in told
         assert "Windows only are 'a'" in told
         assert "install Wine" not in told

@@ -19,7 +19,6 @@ from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
 from fmugym.pool.component_resets import find_component_resets
 from fmugym.pool.spec import ResetMethod
-from fmugym.tools import cli
 from fmugym.trial.trial import examine
 
 pytestmark = pytest.mark.usefixtures("trials")
@@ -226,13 +225,12 @@ class TestTrial:
         assert verdict.reset_method is RESTORE
         assert verdict.components == ()
 
-    def test_info_tells_it(self, fmu_of, tmp_path, capsys):
+    def test_info_tells_it(self, fmu_of, tmp_path, ran):
         system = chain(fmu_of, "well behaved", "reset does nothing")
         archive = ssp_tools.write(system, tmp_path / "chain.ssp")
         system = FMUSystem.read(archive)
         verdict_of(system)
-        assert cli.main(["info", str(archive)]) == 0
-        lines = capsys.readouterr().out.splitlines()
+        lines = ran("info", archive).splitlines()
         (one,) = (line for line in lines if line.strip().startswith("a:"))
         (other,) = (line for line in lines if line.strip().startswith("b:"))
         assert "'restore'" in one

@@ -23,7 +23,7 @@ every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 
 def run(code, *arguments):
     """Run code in another interpreter; returns what it wrote to stdout and stderr."""
-    done = run_python("-W", "error", "-c", code, *map(str, arguments))
+    done = run_python("-W", "error", "-c", code, *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
 

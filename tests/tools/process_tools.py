@@ -28,17 +28,18 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 """The begin of a program that obeys Ctrl-C although its parent ignores it, as in the background."""
 
 
-def run_python(*command, timeout=100):
-    """Run Python in a process of its own."""
+def run_python(*command, environment=(), timeout=100, check=False, **options):
+    """Run Python in a process of its own; the options are those of ``subprocess.run``."""
     path = os.pathsep.join(filter(None, [building.PATH, os.environ.get("PYTHONPATH")]))
-    environment = os.environ | {"PYTHONPATH": path, "MALLOC_PERTURB_": "85"}
+    own = {"PYTHONPATH": path, "MALLOC_PERTURB_": "85", **dict(environment)}
     return subprocess.run(
-        [sys.executable, *command],
-        env=environment,
+        [sys.executable, *map(str, command)],
+        env=os.environ | own,
         capture_output=True,
         text=True,
         timeout=timeout,
-        check=False,
+        check=check,
+        **options,
     )
 
 

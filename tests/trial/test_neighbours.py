@@ -11,7 +11,6 @@ from demanding_tools import STEP, DemandingEnv, expected_outputs, make_fmu
 import fmugym
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec
-from fmugym.tools.cli import main
 from fmugym.trial.known import known_verdict
 from fmugym.trial.neighbours import disturb_in_threads
 from fmugym.trial.subject import Subject
@@ -79,12 +78,11 @@ class TestOneInitializationAtATime:
         assert "its instances are initialized one at a time" in caplog.text
         assert "stepped by one thread" not in caplog.text
 
-    def test_is_told_by_info(self, folder, capsys):
+    def test_is_told_by_info(self, folder, ran):
         path = make_fmu(folder, "strtok")
         fmugym.FMUVectorEnv(lambda: DemandingEnv(path), 2).close()
         assert known_verdict(fmugym.FMU(path)).neighbours is Neighbours.ONE_INITIALIZATION
-        assert main(["info", str(path)]) == 0
-        assert "several instances: initialized one at a time" in capsys.readouterr().out
+        assert "several instances: initialized one at a time" in ran("info", path)
 
 
 class TestGrades:

@@ -26,7 +26,6 @@ from fmugym.errors import ContractError
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
-from fmugym.tools.cli import main
 from fmugym.trial import plan as trial_plan
 from fmugym.trial.inputs import inputs_of_two
 from fmugym.trial.known import known_verdict
@@ -390,11 +389,11 @@ class TestVerdict:
             env.close()
 
 
-def test_info_tells_what_the_trial_has_shown(make_fmu, capsys):
+def test_info_tells_what_the_trial_has_shown(make_fmu, cli):
     path = make_fmu("reset does nothing")
     QuirkEnv(path).close()
-    assert main(["info", str(path)]) in (0, None)
-    shown = capsys.readouterr().out
+    code, shown, _ = cli("info", path)
+    assert code in (0, None)
     assert "reset is wrong, instance is right to the last bit" in shown
     assert "episodes begin by 'instance'" in shown
 

@@ -23,7 +23,6 @@ import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, FMUSystem, bundled_fmu
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
-from fmugym.tools import cli
 from fmugym.trial import opening
 from fmugym.vector import episodes
 from fmugym.wine import windows_worker
@@ -83,9 +82,9 @@ class TestWithoutWine:
         with pytest.raises(FMULoadError, match=r"wine64.*\[windows\]"):
             open_pool(cart_pole)
 
-    def test_info_says_how_to_get_there(self, cart_pole, bare, capsys):
-        assert cli.main(["info", str(cart_pole)]) == 0
-        line, *_ = (r for r in capsys.readouterr().out.splitlines() if "this machine" in r)
+    def test_info_says_how_to_get_there(self, cart_pole, bare, ran):
+        out = ran("info", cart_pole)
+        line, *_ = (r for r in out.splitlines() if "this machine" in r)
         assert "does NOT run here" in line
         assert "wine64" in line
 
@@ -382,9 +381,8 @@ class TestInWine:
             processes.add(pool.processes()[0])
         assert 1 < len(processes) < 10
 
-    def test_info_says_that_it_runs_in_wine(self, cart_pole, capsys):
-        assert cli.main(["info", str(cart_pole)]) == 0
-        assert "win64: runs here, in Wine" in capsys.readouterr().out
+    def test_info_says_that_it_runs_in_wine(self, cart_pole, ran):
+        assert "win64: runs here, in Wine" in ran("info", cart_pole)
 
     def test_a_path_with_blanks_and_umlauts(self, tmp_path, opened):
         folder = tmp_path / "a folder, ü"

@@ -352,7 +352,7 @@ class TestPool:
 
         In a process of its own: an exception out of a signal handler leaves coverage's lock locked.
         """
-        done = run_python("-c", INTERRUPTED, str(faulty))
+        done = run_python("-c", INTERRUPTED, faulty)
         assert done.stdout.splitlines() == ["True", "[0.5, 0.5]"], done.stderr
 
     @posix_only
