@@ -8,7 +8,8 @@ fits nothing, so that code that does not ask these methods fails instead of read
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +29,7 @@ __all__ = [
     "has_symbols",
     "lift",
     "loaded",
+    "loaded_rows",
     "same_cells",
     "same_for_all",
     "spread",
@@ -333,20 +335,31 @@ def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
     return Symbols(graph, cells, array.dtype)
 
 
-def loaded(graph: Graph, kind: str, names: npt.NDArray[Any], dtype: npt.DTypeLike) -> Symbols:
+def loaded(
+    graph: Graph,
+    kind: str,
+    shape: tuple[int, ...],
+    name: Callable[[int], Hashable],
+    dtype: npt.DTypeLike,
+) -> Symbols:
     """Symbols for values that a program loads, the environments on the last axis.
 
     Args:
         graph: Records the operations.
         kind: The kind of node.
-        names: What each element is, an array of objects.
+        shape: Their shape in one environment.
+        name: Tells what an element is, from its number in row-major order.
         dtype: Their type.
     """
-    nodes = empty(names.shape, np.int64)
-    for place in np.ndindex(names.shape):
-        what: Any = names[place]
-        nodes[place] = graph.load(kind, what, dtype, None).node
-    return spread(graph, nodes, dtype, writeable=False)
+    nodes = [graph.load(kind, name(index), dtype, None).node for index in range(math.prod(shape))]
+    return spread(graph, asarray(nodes, np.int64).reshape(shape), dtype, writeable=False)
+
+
+def loaded_rows(
+    graph: Graph, shape: tuple[int, ...], *head: Any, dtype: npt.DTypeLike = np.float64
+) -> Symbols:
+    """Symbols for the rows of an array; a row's name is the head and its number."""
+    return loaded(graph, "row", shape, lambda index: (*head, index), dtype)
 
 
 def spread(

@@ -28,12 +28,13 @@ from fmugym.vector.hooks.hook_results import type_of_variable
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import TYPES, Program, UntraceableError
-from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
+from fmugym.vector.hooks.symbolic import symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
     as_symbols,
     loaded,
+    loaded_rows,
     same_cells,
     same_for_all,
     spread,
@@ -206,8 +207,8 @@ class Tracer:
         for name, table in self._tables.items():
             vars(self._env)[name] = table.view(Table)
         for name, row in self._attributes.items():
-            names = element_names((), "attribute", name)
-            vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
+            symbols = loaded_rows(self._graph, (), "attribute", name, dtype=row.dtype)
+            vars(self._env)[name] = symbols
         self._env.inside.readings = symbolic_readings(
             self._env, self._graph, self._variables, judging
         )
@@ -240,7 +241,7 @@ class Tracer:
 
     def _told(self, kind: str) -> Any:
         """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
-        return loaded(self._graph, kind, np.array(None, object), np.bool_)
+        return loaded(self._graph, kind, (), lambda _: None, np.bool_)
 
     # Inputs.
 
