@@ -19,6 +19,7 @@ from fmugym.checks import (
 from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
 from fmugym.signals import ordinary
+from fmugym.vector.action_arrays import array_of
 
 __all__ = [
     "ARGUMENTS",
@@ -179,12 +180,8 @@ def _checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """
     if mask is None:
         return np.ones(num_envs, np.bool_)
-    try:
-        array = np.array(mask)
-        fits = array.shape == (num_envs,) and array.dtype == np.bool_ and bool(array.any())
-    except ordinary(Exception):  # lists that make no array, and the user's own __array__
-        fits = False
-    if not fits:
+    array = array_of(mask)
+    if array.shape != (num_envs,) or array.dtype != np.bool_ or not array.any():
         raise ConfigError(
             f"options['reset_mask'] must be a Boolean array of shape ({num_envs},) with at least "
             f"one True, got {shown(mask)}"
