@@ -152,7 +152,7 @@ def _logic_of_ideal(
             f"{env.action_space}"
         )
     try:
-        with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+        with exclusive, borrowed(env), tables_in(env), reading(env, Readings.of(env)):
             traced = _ControllerTracer(env, decision)
         return _Assembly(env, traced, decision, all_inputs, external).logic()
     except UntraceableError as error:

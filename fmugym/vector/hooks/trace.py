@@ -143,7 +143,7 @@ def trace_hooks(
         raise UntraceableError("the pool tells infos of its own")
     if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
         raise UntraceableError(f"its actions are {env.action_space.dtype}")
-    with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
+    with exclusive, borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
         tracer = Tracer(env, attributes, refused)
         return tracer.settle(tracer.task)
 
