@@ -130,11 +130,9 @@ def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
     """Turn the argument ``seed`` of ``reset`` into one seed or None for each environment.
 
     Raises:
-        ConfigError: If it is neither None, an integer that is not negative, nor a sequence of N
-            of them.
+        ConfigError: If it is neither an integer that is not negative, nor a sequence of N of them,
+            some of which may be None.
     """
-    if seed is None:
-        return [None] * num_envs
     first = integer_of(seed)
     if first is not None:
         check_seed(first)

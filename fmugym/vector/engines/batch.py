@@ -35,7 +35,7 @@ from fmugym.task.readings import Readings, environments_last, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
-from fmugym.vector.action_arrays import checked_actions
+from fmugym.vector.action_arrays import array_of, checked_actions
 from fmugym.vector.calls import MethodCalls
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
@@ -840,10 +840,7 @@ def _set_all(env: FMUEnv, attributes: Mapping[str, Any]) -> None:
 
 
 def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
-    try:
-        row = np.array(values)
-    except (TypeError, ValueError):  # lists that do not form an array
-        row = np.empty(0, object)
+    row = array_of(values)
     if row.ndim != 1 or row.dtype.kind not in "biuf":
         raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")
     return row
