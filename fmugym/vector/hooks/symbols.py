@@ -328,11 +328,8 @@ def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
     letter_of(array.dtype)
     if array.size > _MOST_ELEMENTS:
         raise UntraceableError("it computes with a large array")
-    cells = empty(array.shape, object)
-    flat = cells.reshape(-1)
-    for index, value in enumerate(array.reshape(-1)):
-        flat[index] = graph.constant(value, array.dtype)
-    return Symbols(graph, cells, array.dtype)
+    cells = np.fromiter((graph.constant(value, array.dtype) for value in array.flat), object)
+    return Symbols(graph, cells.reshape(array.shape), array.dtype)
 
 
 def loaded(
@@ -351,8 +348,9 @@ def loaded(
         name: Tells what an element is, from its number in row-major order.
         dtype: Their type.
     """
-    nodes = [graph.load(kind, name(index), dtype, None).node for index in range(math.prod(shape))]
-    return spread(graph, asarray(nodes, np.int64).reshape(shape), dtype, writeable=False)
+    loads = (graph.load(kind, name(index), dtype, None) for index in range(math.prod(shape)))
+    nodes = np.fromiter((cell.node for cell in loads), np.int64)
+    return spread(graph, nodes.reshape(shape), dtype, writeable=False)
 
 
 def loaded_rows(
@@ -366,10 +364,8 @@ def spread(
     graph: Graph, nodes: npt.NDArray[Any], dtype: npt.DTypeLike, writeable: bool = True
 ) -> Symbols:
     """Symbols of nodes, the environments on the last axis."""
-    cells = empty((*nodes.shape, LANES), object)
-    for place in np.ndindex(nodes.shape):
-        for lane in range(LANES):
-            cells[(*place, lane)] = Cell(int(nodes[place]), lane)
+    lanes = (Cell(node, lane) for node in nodes.reshape(-1).tolist() for lane in range(LANES))
+    cells = np.fromiter(lanes, object).reshape(*nodes.shape, LANES)
     return Symbols(graph, cells, dtype, writeable)
 
 
@@ -391,12 +387,10 @@ def same_for_all(symbols: Symbols) -> npt.NDArray[Any]:
     cells = symbols.cells
     if cells.shape[-1:] != (LANES,):
         raise UntraceableError(f"a result has the shape {cells.shape}, environments last")
-    nodes = empty(cells.shape[:-1], np.int64)
-    for place in np.ndindex(nodes.shape):
-        row = cells[place]
+    rows = cells.reshape(-1, LANES)
+    for row in rows:
         if len({cell.node for cell in row}) > 1 or any(
             cell.lane not in (None, lane) for lane, cell in enumerate(row)
         ):
             raise UntraceableError("it treats environments differently")
-        nodes[place] = row[0].node
-    return nodes
+    return np.fromiter((row[0].node for row in rows), np.int64).reshape(cells.shape[:-1])
