@@ -20,7 +20,7 @@ from fmugym.env import FMUEnv
 from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.hooks.tables import functions_of, places_of
 
-__all__ = ["Changes", "Contents", "borrowed", "differs"]
+__all__ = ["OURS", "Changes", "Contents", "borrowed", "differs"]
 
 _NOT_COMPARED: Final = "inside"
 """The attribute that the caller of hooks and the pool change."""
@@ -28,7 +28,7 @@ _NOT_COMPARED: Final = "inside"
 _LARGEST_OUTSIDE: Final = 2000
 """Global variables with more elements are taken for data, which no hook changes."""
 
-_OURS: Final = ("fmugym", "gymnasium", "logging")
+OURS: Final = ("fmugym", "gymnasium", "logging")
 """Packages whose objects hooks only read."""
 
 
@@ -294,7 +294,7 @@ def _kind_of(value: Any) -> _Kind | None:
     cls = type(value)
     if issubclass(cls, _PLAIN):
         return None
-    if cls.__module__.partition(".")[0] in _OURS or issubclass(cls, (gymnasium.Env, spaces.Space)):
+    if cls.__module__.partition(".")[0] in OURS or issubclass(cls, (gymnasium.Env, spaces.Space)):
         return None
     for base in cls.__mro__:
         if base in _KINDS:

@@ -19,6 +19,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
@@ -58,9 +59,6 @@ from fmugym.vector.vector_saving import (
 from fmugym.vector.views import batched, column, some, take
 
 __all__ = ["BatchEngine"]
-
-IndexArray = npt.NDArray[np.intp]
-
 
 logger = logging.getLogger(__name__)
 

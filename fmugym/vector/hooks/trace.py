@@ -157,6 +157,8 @@ class Tracer:
         refused: Hooks that are not to be traced, and why.
     """
 
+    _contents: Contents
+
     def __init__(
         self,
         env: FMUEnv,
@@ -165,7 +167,6 @@ class Tracer:
     ) -> None:
         self._env, self._attributes, self._refused = env, attributes, refused
         self._graph = Graph()
-        self._contents = Contents(env)
         self._left: dict[str, str] = {}
         self._tables = dict(tables_of(env))
         self._variables: dict[str, np.dtype[Any]] = {
