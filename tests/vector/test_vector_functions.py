@@ -48,6 +48,12 @@ def require_same(function, *arrays):
     assert found[numbers].tobytes() == expected[numbers].tobytes()
 
 
+def test_numpy_is_the_same_after_a_trace():
+    before = np.array, np.take, np.linalg.norm
+    compiled(np.negative, np.ones(3))
+    assert (np.array, np.take, np.linalg.norm) == before
+
+
 def values(letter, count=COUNT, seed=0):
     """Random values of a type, with the difficult ones among them."""
     rng = np.random.default_rng(seed)
