@@ -29,8 +29,7 @@ from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.symbolic import element_names
-from fmugym.vector.hooks.symbols import LANES, as_symbols, loaded, spread
+from fmugym.vector.hooks.symbols import LANES, as_symbols, loaded_rows, spread
 from fmugym.vector.hooks.tables import tables_in
 from fmugym.vector.hooks.trace import Tracer
 
@@ -153,7 +152,7 @@ def _logic_of_ideal(
             f"{env.action_space}"
         )
     try:
-        with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+        with exclusive, borrowed(env), tables_in(env), reading(env, Readings.of(env)):
             traced = _ControllerTracer(env, decision)
         return _Assembly(env, traced, decision, all_inputs, external).logic()
     except UntraceableError as error:
@@ -203,7 +202,7 @@ class _ControllerTracer(Tracer):
         graph, space, double = self._graph, self._env.action_space, np.dtype(np.float64)
         observed = [spread(graph, np.array(n), graph.nodes[n].dtype) for n in observation]
         memory = [
-            loaded(graph, "row", element_names(start.shape, "before", name), double)
+            loaded_rows(graph, start.shape, "before", name)
             for name, start in self._decision.starts.items()
         ]
         action, then = self._decision.decide(as_symbols(graph, observed), memory, self._asked)
@@ -224,13 +223,13 @@ class _ControllerTracer(Tracer):
             features = network.scaled(features)
             count, dtype = sum(network.parts), network.dtype
         self.features = tuple(self._nodes(features, None, None).tolist())
-        return loaded(self._graph, "row", element_names((count,), _GIVEN), dtype)
+        return loaded_rows(self._graph, (count,), _GIVEN, dtype=dtype)
 
     def _followed(self, action: npt.NDArray[Any]) -> tuple[tuple[bool, ...], tuple[int, ...]]:
         """Which inputs any action changes, and the nodes of the inputs after the chosen one."""
         env, dtype = self._env, np.dtype(self._env.action_space.dtype)
         env.previous_action, env.previous_state = env.action, env.state
-        unknown = loaded(self._graph, "row", element_names(action.shape, _ANY_ACTION), dtype)
+        unknown = loaded_rows(self._graph, action.shape, _ANY_ACTION, dtype=dtype)
         found = []
         for one in (unknown, unknown.like(spread(self._graph, action, dtype).cells)):
             env.action = one

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 
-__all__ = ["checked_actions", "is_array_space"]
+__all__ = ["array_of", "checked_actions", "is_array_space"]
 
 _ARRAY_SPACES: Final = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
@@ -39,7 +39,9 @@ def checked_actions(space: Any, num_envs: int, actions: Any) -> npt.NDArray[Any]
         ConfigError: If the shape or the type does not fit, an action of a ``Discrete`` is out of
             its range, or one is NaN.
     """
-    array = _numbers(actions)
+    array = array_of(actions)
+    if array.dtype.kind not in "biuf":
+        raise ConfigError(f"the actions do not make an array of numbers: {shown(actions)}")
     if array.shape != (num_envs, *space.shape):
         raise ConfigError(
             f"the actions have shape {array.shape}, expected {(num_envs, *space.shape)}"
@@ -53,15 +55,12 @@ def checked_actions(space: Any, num_envs: int, actions: Any) -> npt.NDArray[Any]
     return array
 
 
-def _numbers(actions: Any) -> npt.NDArray[Any]:
+def array_of(value: Any) -> npt.NDArray[Any]:
+    """A new array of what a caller gave; an empty one of objects if it makes none."""
     try:
-        array = np.array(actions)
-        is_numeric = array.dtype.kind in "biuf"
+        return np.array(value)
     except ordinary(Exception):  # lists that make no array, and the user's own __array__
-        is_numeric = False
-    if not is_numeric:
-        raise ConfigError(f"the actions do not make an array of numbers: {shown(actions)}")
-    return array
+        return np.empty(0, object)
 
 
 def _require_numbers(array: npt.NDArray[Any]) -> None:

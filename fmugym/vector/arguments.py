@@ -19,6 +19,7 @@ from fmugym.checks import (
 from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
 from fmugym.signals import ordinary
+from fmugym.vector.action_arrays import array_of
 
 __all__ = [
     "ARGUMENTS",
@@ -129,11 +130,9 @@ def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
     """Turn the argument ``seed`` of ``reset`` into one seed or None for each environment.
 
     Raises:
-        ConfigError: If it is neither None, an integer that is not negative, nor a sequence of N
-            of them.
+        ConfigError: If it is neither an integer that is not negative, nor a sequence of N of them,
+            some of which may be None.
     """
-    if seed is None:
-        return [None] * num_envs
     first = integer_of(seed)
     if first is not None:
         check_seed(first)
@@ -179,12 +178,8 @@ def _checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """
     if mask is None:
         return np.ones(num_envs, np.bool_)
-    try:
-        array = np.array(mask)
-        fits = array.shape == (num_envs,) and array.dtype == np.bool_ and bool(array.any())
-    except ordinary(Exception):  # lists that make no array, and the user's own __array__
-        fits = False
-    if not fits:
+    array = array_of(mask)
+    if array.shape != (num_envs,) or array.dtype != np.bool_ or not array.any():
         raise ConfigError(
             f"options['reset_mask'] must be a Boolean array of shape ({num_envs},) with at least "
             f"one True, got {shown(mask)}"

@@ -29,14 +29,15 @@ class PoolColumn(Pool):
 
     def __init__(self, pool: Pool, index: int) -> None:
         self._pool, self._index = pool, index
-        self.inputs: FloatArray = pool.inputs[:, index : index + 1]
-        self.outputs: FloatArray = pool.outputs[:, index : index + 1]
-        self.statuses: StatusArray = pool.statuses[index : index + 1]
-        self.observations = pool.observations[index : index + 1]
+        self._part = part = slice(index, index + 1)
+        self.inputs: FloatArray = pool.inputs[:, part]
+        self.outputs: FloatArray = pool.outputs[:, part]
+        self.statuses: StatusArray = pool.statuses[part]
+        self.observations = pool.observations[part]
 
-    def _mask(self, value: bool) -> MaskArray:
-        mask = np.full(self._pool.num_instances, not value)
-        mask[self._index] = value
+    def _others(self) -> MaskArray:
+        mask = np.ones(self._pool.num_instances, np.bool_)
+        mask[self._index] = False
         return mask
 
     def reset(
@@ -44,7 +45,7 @@ class PoolColumn(Pool):
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
         all_values = np.repeat(values, self._pool.num_instances, axis=1)
-        self._pool.reset(variables, all_values, self._mask(True))
+        self._pool.reset(variables, all_values, ~self._others())
         return self.outputs, self.statuses
 
     def step(
@@ -56,7 +57,7 @@ class PoolColumn(Pool):
         """See ``Pool.step``."""
         if inputs is not None:
             self.inputs[:] = inputs
-        self._pool.step(None, self._mask(False))
+        self._pool.step(None, self._others())
         return self.outputs, self.statuses
 
     def step_own(self) -> int:
@@ -87,14 +88,11 @@ class PoolColumn(Pool):
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
-        return self._pool.read(variables)[:, self._index : self._index + 1]
+        return self._pool.read(variables)[:, self._part]
 
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
         """See ``Pool.health``."""
-        return {
-            name: counts[self._index : self._index + 1]
-            for name, counts in self._pool.health().items()
-        }
+        return {name: counts[self._part] for name, counts in self._pool.health().items()}
 
     def forget_health(self) -> None:
         """See ``Pool.forget_health``; this affects the counts of all instances."""
@@ -120,8 +118,7 @@ class PoolColumn(Pool):
 
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """See ``Pool.info``."""
-        column = slice(self._index, self._index + 1)
-        return {name: row[column] for name, row in self._pool.info().items()}
+        return {name: row[self._part] for name, row in self._pool.info().items()}
 
     def close(self) -> None:
         """Do nothing: the vector environment closes the pool."""

@@ -20,7 +20,7 @@ from fmugym.env import FMUEnv
 from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.hooks.tables import functions_of, places_of
 
-__all__ = ["Changes", "Contents", "borrowed", "differs"]
+__all__ = ["OURS", "Changes", "Contents", "borrowed", "differs"]
 
 _NOT_COMPARED: Final = "inside"
 """The attribute that the caller of hooks and the pool change."""
@@ -28,7 +28,7 @@ _NOT_COMPARED: Final = "inside"
 _LARGEST_OUTSIDE: Final = 2000
 """Global variables with more elements are taken for data, which no hook changes."""
 
-_OURS: Final = ("fmugym", "gymnasium", "logging")
+OURS: Final = ("fmugym", "gymnasium", "logging")
 """Packages whose objects hooks only read."""
 
 
@@ -36,14 +36,14 @@ class _Kind(NamedTuple):
     """A kind of object that can change in place.
 
     Attributes:
+        parts: The objects in the contents.
         copy: Copies the contents, but not the objects in them.
         restore: Writes such a copy back to the object.
-        parts: The objects in the contents.
     """
 
-    copy: Callable[[Any], Any]
-    restore: Callable[[Any, Any], Any]
     parts: Callable[[Any], Iterable[Any]]
+    copy: Callable[[Any], Any] = lambda value: value
+    restore: Callable[[Any, Any], Any] = lambda value, contents: None
 
 
 class _Kept(NamedTuple):
@@ -254,39 +254,35 @@ def _parts_of_function(function: Any) -> list[Any]:
     return [*(function.__closure__ or ()), *(function.__defaults__ or ()), function.__kwdefaults__]
 
 
-def _nothing(*_: Any) -> tuple[()]:
+def _nothing(_: Any) -> tuple[()]:
     return ()
 
 
-def _same(value: Any) -> Any:
-    return value
-
-
 _KINDS: Final[Mapping[type, _Kind]] = {
-    dict: _Kind(dict, _restore_dict, dict.values),
-    list: _Kind(list, _restore_list, _same),
-    bytearray: _Kind(bytes, _restore_list, _nothing),
-    set: _Kind(set, _restore_by_methods, _same),
-    deque: _Kind(list, _restore_by_methods, _same),
-    tuple: _Kind(_same, _nothing, _same),
-    frozenset: _Kind(_same, _nothing, _same),
-    MappingProxyType: _Kind(_same, _nothing, lambda proxy: proxy.values()),
-    np.ndarray: _Kind(np.copy, _restore_array, _parts_of_array),
-    np.random.Generator: _Kind(_same, _nothing, lambda generator: [generator.bit_generator]),
+    dict: _Kind(dict.values, dict, _restore_dict),
+    list: _Kind(iter, list, _restore_list),
+    bytearray: _Kind(_nothing, bytes, _restore_list),
+    set: _Kind(iter, set, _restore_by_methods),
+    deque: _Kind(iter, list, _restore_by_methods),
+    tuple: _Kind(iter),
+    frozenset: _Kind(iter),
+    MappingProxyType: _Kind(lambda proxy: proxy.values()),
+    np.ndarray: _Kind(_parts_of_array, np.copy, _restore_array),
+    np.random.Generator: _Kind(lambda generator: [generator.bit_generator]),
     np.random.BitGenerator: _Kind(
-        lambda bits: bits.state, lambda bits, state: setattr(bits, "state", state), _nothing
+        _nothing, lambda bits: bits.state, lambda bits, state: setattr(bits, "state", state)
     ),
-    random.Random: _Kind(random.Random.getstate, random.Random.setstate, _nothing),
+    random.Random: _Kind(_nothing, random.Random.getstate, random.Random.setstate),
     CellType: _Kind(
+        iter,
         lambda cell: [cell.cell_contents],
         lambda cell, contents: setattr(cell, "cell_contents", contents[0]),
-        _same,
     ),
-    FunctionType: _Kind(_same, _nothing, _parts_of_function),
-    MethodType: _Kind(_same, _nothing, lambda method: [method.__self__]),
-    partial: _Kind(_same, _nothing, lambda made: [made.func, made.args, made.keywords]),
+    FunctionType: _Kind(_parts_of_function),
+    MethodType: _Kind(lambda method: [method.__self__]),
+    partial: _Kind(lambda made: [made.func, made.args, made.keywords]),
 }
-_INSTANCE: Final = _Kind(_attributes_of, _restore_attributes, dict.values)
+_INSTANCE: Final = _Kind(dict.values, _attributes_of, _restore_attributes)
 _PLAIN: Final = (
     *(bool, int, float, complex, str, bytes, type(None), np.generic),
     *(type, ModuleType, PurePath),
@@ -298,7 +294,7 @@ def _kind_of(value: Any) -> _Kind | None:
     cls = type(value)
     if issubclass(cls, _PLAIN):
         return None
-    if cls.__module__.partition(".")[0] in _OURS or issubclass(cls, (gymnasium.Env, spaces.Space)):
+    if cls.__module__.partition(".")[0] in OURS or issubclass(cls, (gymnasium.Env, spaces.Space)):
         return None
     for base in cls.__mro__:
         if base in _KINDS:

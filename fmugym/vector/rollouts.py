@@ -14,9 +14,8 @@ from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.signals import ordinary
 from fmugym.task.snapshot import Columns
-from fmugym.vector.action_arrays import checked_actions, is_array_space
+from fmugym.vector.action_arrays import array_of, checked_actions, is_array_space
 from fmugym.vector.codec import mapped
 from fmugym.vector.engines.engine import Engine, StepResult
 from fmugym.vector.infos import copy_rows
@@ -317,10 +316,7 @@ def _checked_array(space: Any, actions: Any) -> npt.NDArray[Any]:
     """The actions as an array of shape (n, horizon, ...) and of the type of the space."""
     if not is_array_space(space):
         raise ConfigError(f"the actions of {space} make no array; give rollout a policy instead")
-    try:
-        array = np.asarray(actions)
-    except ordinary(Exception):  # lists that make no array, and the user's own __array__
-        array = np.empty(0)
+    array = array_of(actions)
     if array.ndim < 2 or array.shape[2:] != space.shape or not array.size:
         raise ConfigError(
             f"the actions have shape {array.shape}, expected (n, horizon"

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray
+from fmugym.pool.bundle import IndexArray
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import row_of, state_of
 
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from fmugym.vector.vector_saving import Which
 
 __all__ = ["EpisodeStreams"]
-
-IndexArray = npt.NDArray[np.intp]
 
 _NONE: Final = -1
 _SEED_BITS: Final = 128

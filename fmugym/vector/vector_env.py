@@ -305,7 +305,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _require_ready(self, method: str, *, ended: bool = False) -> None:
         """Refuse a call before the first reset and so on; ``ended`` episodes may be allowed."""
         if not self.inside.episodes.is_ready or self.closed or self._background.is_pending:
-            self._refuse_step(method)
+            require_open(self, method)
+            when = "before the first reset"
+            if self.inside.episodes.started:
+                when = "after an exception that has ended all episodes; call reset first"
+            raise SimulationError(f"{method} was called {when}")
         engine = self.inside.engine
         if not ended and engine.any_ended and self._waits:
             index = int(np.flatnonzero(engine.ended)[0])
@@ -334,15 +338,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.inside.pool.halt()
         if self.inside.engine.has_moved:
             self.inside.episodes.is_ready = False
-
-    def _refuse_step(self, method: str) -> None:
-        require_open(self, method)
-        if self.inside.episodes.started:
-            raise SimulationError(
-                f"{method} was called after an exception that has ended all episodes; call reset "
-                "first"
-            )
-        raise SimulationError(f"{method} was called before the first reset")
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Start the next episodes in the step that ended some, where the engine has not."""

@@ -19,6 +19,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
@@ -35,7 +36,7 @@ from fmugym.task.readings import Readings, environments_last, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
-from fmugym.vector.action_arrays import checked_actions
+from fmugym.vector.action_arrays import array_of, checked_actions
 from fmugym.vector.calls import MethodCalls
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
@@ -58,9 +59,6 @@ from fmugym.vector.vector_saving import (
 from fmugym.vector.views import batched, column, some, take
 
 __all__ = ["BatchEngine"]
-
-IndexArray = npt.NDArray[np.intp]
-
 
 logger = logging.getLogger(__name__)
 
@@ -839,10 +837,7 @@ def _set_all(env: FMUEnv, attributes: Mapping[str, Any]) -> None:
 
 
 def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
-    try:
-        row = np.array(values)
-    except (TypeError, ValueError):  # lists that do not form an array
-        row = np.empty(0, object)
+    row = array_of(values)
     if row.ndim != 1 or row.dtype.kind not in "biuf":
         raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")
     return row

@@ -220,7 +220,7 @@ def _info_row(name: str, value: Any, count: int) -> Any:
 
 def _everywhere(value: Any, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """The same value for all environments; text and objects stay what they are."""
-    if array.dtype.kind in "bifc" or array.dtype.kind == "u":
+    if array.dtype.kind in "biufc":
         return np.full(count, array[()])
     objects = np.empty(count, object)
     objects[:] = [value] * count

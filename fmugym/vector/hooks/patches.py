@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
@@ -22,7 +22,8 @@ _array_function, _full_function, _empty_function = np.array, np.full, np.empty
 _tracing = threading.local()
 """Has the ``graph`` that this thread records, if any."""
 
-_lock = threading.RLock()
+exclusive: Final = threading.RLock()
+"""Keeps other threads from tracing. They would find what stands in the place of tables."""
 
 
 def _patched(function: Any, own: Callable[..., Any]) -> Callable[..., Any]:
@@ -42,7 +43,7 @@ def _array(
     graph: Graph, function: Any, value: Any, dtype: Any = None, *args: Any, **kw: Any
 ) -> Any:
     if not has_symbols(value):
-        return _as_table(function(value, dtype, *args, **kw))
+        return _tabulated(graph, function, value, dtype, *args, **kw)
     symbols = as_symbols(graph, value)
     wanted = symbols.dtype if dtype is None else np.dtype(dtype)
     is_new = function is _array_function or symbols.dtype != wanted
@@ -60,12 +61,9 @@ def _made(graph: Graph, function: Any, shape: Any, *args: Any, **keywords: Any) 
     return lift(graph, array) if is_of_all else array
 
 
-def _as_table(array: Any) -> Any:
+def _tabulated(graph: Graph, function: Any, *args: Any, **keywords: Any) -> Any:
+    array = function(*args, **keywords)
     return array.view(tables.Table) if tables.is_table(array) and array.ndim else array
-
-
-def _counted(graph: Graph, function: Any, *args: Any, **keywords: Any) -> Any:
-    return _as_table(function(*args, **keywords))
 
 
 def _looked_up(graph: Graph, function: Any, *args: Any, **keywords: Any) -> Any:
@@ -82,7 +80,7 @@ def _of_list(graph: Graph, function: Any, a: Any, *args: Any, **keywords: Any) -
 _OVERRIDING: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("array", "asarray", "asanyarray", "ascontiguousarray"), _array),
     **dict.fromkeys(("zeros", "ones", "full", "empty"), _made),
-    **dict.fromkeys(("linspace", "arange"), _counted),
+    **dict.fromkeys(("linspace", "arange"), _tabulated),
     **{function.__name__: _looked_up for function in tables.FUNCTIONS},
     **{function.__name__: _of_list for function in COMPOSED},
     **dict.fromkeys(("transpose", "reshape", "ravel", "flip", "roll", "moveaxis"), _of_list),
@@ -90,17 +88,10 @@ _OVERRIDING: Final[Mapping[str, Any]] = {
 }
 """What each function does with symbols, by its name."""
 
-_PATCHES: Final = [
+_PATCHES: Final[Sequence[Any]] = [
     *((np, name, _patched(getattr(np, name), own)) for name, own in _OVERRIDING.items()),
     (np.linalg, "norm", _patched(np.linalg.norm, _of_list)),
 ]
-
-_ORIGINALS: Final = [(module, name, getattr(module, name)) for module, name, _ in _PATCHES]
-
-
-def exclusive() -> AbstractContextManager[Any]:
-    """Keep other threads from tracing. They would find what stands in the place of tables."""
-    return _lock
 
 
 @contextmanager
@@ -111,7 +102,7 @@ def numpy_of(graph: Graph) -> Iterator[None]:
     a list. So they are replaced while hooks are traced. In other threads they do what they always
     do.
     """
-    with _lock:
+    with exclusive:
         try:
             for module, name, function in _PATCHES:
                 setattr(module, name, function)
@@ -119,5 +110,5 @@ def numpy_of(graph: Graph) -> Iterator[None]:
             yield
         finally:
             _tracing.graph = None
-            for module, name, function in _ORIGINALS:
-                setattr(module, name, function)
+            for module, name, function in _PATCHES:
+                setattr(module, name, function.__wrapped__)

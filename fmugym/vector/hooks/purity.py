@@ -10,15 +10,13 @@ import gymnasium
 import numpy as np
 
 from fmugym.env import FMUEnv
+from fmugym.vector.contents import OURS
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.tables import functions_of, names_in, places_of
 
 __all__ = ["names_in_hooks", "require_pure"]
 
 _LEAVES: Final = (bool, int, float, complex, str, bytes, type(None), range, np.generic)
-
-_OURS: Final = ("fmugym", "gymnasium", "logging")
-"""Packages whose objects hooks only read."""
 
 _ACTING: Final = frozenset(
     {"print", "open", "input", "exec", "eval", "setattr", "random", "breakpoint", "set_trace"}
@@ -37,7 +35,7 @@ def _is_ours(value: Any) -> bool:
     if isinstance(value, gymnasium.Env):
         return False
     module = getattr(value, "__module__", None) or type(value).__module__
-    return isinstance(module, str) and module.partition(".")[0] in _OURS
+    return isinstance(module, str) and module.partition(".")[0] in OURS
 
 
 def _is_plain(value: Any) -> bool:

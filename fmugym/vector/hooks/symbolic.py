@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
 from fmugym.task.values import NamedTexts, ParameterValues
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.symbols import LANES, Symbols, lift, loaded
+from fmugym.vector.hooks.symbols import LANES, lift, loaded, loaded_rows
 from fmugym.vector.views import batched
 
-__all__ = ["element_names", "symbolic_readings"]
+__all__ = ["symbolic_readings"]
 
 
 def symbolic_readings(
@@ -31,10 +31,7 @@ def symbolic_readings(
         variables: The types of the episode variables.
         judging: Whether the FMU has stepped.
     """
-
-    def rows(shape: tuple[int, ...], *head: Any, dtype: Any = np.float64) -> Any:
-        return loaded(graph, "row", element_names(shape, *head), dtype)
-
+    rows: Callable[..., Any] = partial(loaded_rows, graph)
     values, strings = rows((len(env.out),), "output"), env.fmu.description.strings
     read = batched(env, LANES, values, rows((len(env.inside.interface.inputs),), "input"))
     read.out = _SymbolicOutputs(
@@ -42,15 +39,17 @@ def symbolic_readings(
     )
     kept = rows((len(env.out),), "kept") if judging else values
     read.previous_state = kept[: env.inside.output_count]
+    space: Any = env.action_space
     for name in ("action", "previous_action"):
-        setattr(read, name, _symbolic_action(env, graph, name))
+        symbols = loaded(graph, name, space.shape or (), lambda index: index, space.dtype)
+        setattr(read, name, symbols)
     read.step_count = rows((), "step_count", dtype=np.int64)
-    missing = np.array("it reads self.done before there is one", object)
-    read.done = loaded(graph, "missing", missing, np.bool_)
+    missing = "it reads self.done before there is one"
+    read.done = loaded(graph, "missing", (), lambda _: missing, np.bool_)
     read.after_end = lift(graph, read.after_end)
     known = dict.fromkeys((*env.inside.interface.parameters, *env.parameters))
-    symbols = {name: rows((), "parameter", name) for name in known}
-    read.parameters = MappingProxyType(_SymbolicParameters(symbols, strings))
+    parameters = {name: rows((), "parameter", name) for name in known}
+    read.parameters = MappingProxyType(_SymbolicParameters(parameters, strings))
     for name, dtype in variables.items():
         shape = np.shape(env.config.episode_variables[name])
         head = "before" if judging else "variable", name
@@ -89,19 +88,3 @@ class _SymbolicParameters(ParameterValues):
     def _require_number(self, name: Any) -> None:
         if name in self._strings:
             raise UntraceableError(f"it reads the String {name!r}")
-
-
-def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
-    space: Any = env.action_space
-    names = np.empty(space.shape or (), object)
-    for index, place in enumerate(np.ndindex(names.shape)):
-        names[place] = index
-    return loaded(graph, kind, names, space.dtype)
-
-
-def element_names(shape: tuple[int, ...], *head: Any) -> npt.NDArray[Any]:
-    """The rows of an array: a name for each element."""
-    names = np.empty(shape, object)
-    for index, place in enumerate(np.ndindex(shape)):
-        names[place] = (*head, index)
-    return names

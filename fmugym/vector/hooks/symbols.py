@@ -8,7 +8,8 @@ fits nothing, so that code that does not ask these methods fails instead of read
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -28,6 +29,7 @@ __all__ = [
     "has_symbols",
     "lift",
     "loaded",
+    "loaded_rows",
     "same_cells",
     "same_for_all",
     "spread",
@@ -326,37 +328,44 @@ def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
     letter_of(array.dtype)
     if array.size > _MOST_ELEMENTS:
         raise UntraceableError("it computes with a large array")
-    cells = empty(array.shape, object)
-    flat = cells.reshape(-1)
-    for index, value in enumerate(array.reshape(-1)):
-        flat[index] = graph.constant(value, array.dtype)
-    return Symbols(graph, cells, array.dtype)
+    cells = np.fromiter((graph.constant(value, array.dtype) for value in array.flat), object)
+    return Symbols(graph, cells.reshape(array.shape), array.dtype)
 
 
-def loaded(graph: Graph, kind: str, names: npt.NDArray[Any], dtype: npt.DTypeLike) -> Symbols:
+def loaded(
+    graph: Graph,
+    kind: str,
+    shape: tuple[int, ...],
+    name: Callable[[int], Hashable],
+    dtype: npt.DTypeLike,
+) -> Symbols:
     """Symbols for values that a program loads, the environments on the last axis.
 
     Args:
         graph: Records the operations.
         kind: The kind of node.
-        names: What each element is, an array of objects.
+        shape: Their shape in one environment.
+        name: Tells what an element is, from its number in row-major order.
         dtype: Their type.
     """
-    nodes = empty(names.shape, np.int64)
-    for place in np.ndindex(names.shape):
-        what: Any = names[place]
-        nodes[place] = graph.load(kind, what, dtype, None).node
-    return spread(graph, nodes, dtype, writeable=False)
+    loads = (graph.load(kind, name(index), dtype, None) for index in range(math.prod(shape)))
+    nodes = np.fromiter((cell.node for cell in loads), np.int64)
+    return spread(graph, nodes.reshape(shape), dtype, writeable=False)
+
+
+def loaded_rows(
+    graph: Graph, shape: tuple[int, ...], *head: Any, dtype: npt.DTypeLike = np.float64
+) -> Symbols:
+    """Symbols for the rows of an array; a row's name is the head and its number."""
+    return loaded(graph, "row", shape, lambda index: (*head, index), dtype)
 
 
 def spread(
     graph: Graph, nodes: npt.NDArray[Any], dtype: npt.DTypeLike, writeable: bool = True
 ) -> Symbols:
     """Symbols of nodes, the environments on the last axis."""
-    cells = empty((*nodes.shape, LANES), object)
-    for place in np.ndindex(nodes.shape):
-        for lane in range(LANES):
-            cells[(*place, lane)] = Cell(int(nodes[place]), lane)
+    lanes = (Cell(node, lane) for node in nodes.reshape(-1).tolist() for lane in range(LANES))
+    cells = np.fromiter(lanes, object).reshape(*nodes.shape, LANES)
     return Symbols(graph, cells, dtype, writeable)
 
 
@@ -378,12 +387,10 @@ def same_for_all(symbols: Symbols) -> npt.NDArray[Any]:
     cells = symbols.cells
     if cells.shape[-1:] != (LANES,):
         raise UntraceableError(f"a result has the shape {cells.shape}, environments last")
-    nodes = empty(cells.shape[:-1], np.int64)
-    for place in np.ndindex(nodes.shape):
-        row = cells[place]
+    rows = cells.reshape(-1, LANES)
+    for row in rows:
         if len({cell.node for cell in row}) > 1 or any(
             cell.lane not in (None, lane) for lane, cell in enumerate(row)
         ):
             raise UntraceableError("it treats environments differently")
-        nodes[place] = row[0].node
-    return nodes
+    return np.fromiter((row[0].node for row in rows), np.int64).reshape(cells.shape[:-1])

@@ -28,12 +28,13 @@ from fmugym.vector.hooks.hook_results import type_of_variable
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import TYPES, Program, UntraceableError
-from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
+from fmugym.vector.hooks.symbolic import symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
     as_symbols,
     loaded,
+    loaded_rows,
     same_cells,
     same_for_all,
     spread,
@@ -142,7 +143,7 @@ def trace_hooks(
         raise UntraceableError("the pool tells infos of its own")
     if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
         raise UntraceableError(f"its actions are {env.action_space.dtype}")
-    with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
+    with exclusive, borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
         tracer = Tracer(env, attributes, refused)
         return tracer.settle(tracer.task)
 
@@ -156,6 +157,8 @@ class Tracer:
         refused: Hooks that are not to be traced, and why.
     """
 
+    _contents: Contents
+
     def __init__(
         self,
         env: FMUEnv,
@@ -164,7 +167,6 @@ class Tracer:
     ) -> None:
         self._env, self._attributes, self._refused = env, attributes, refused
         self._graph = Graph()
-        self._contents = Contents(env)
         self._left: dict[str, str] = {}
         self._tables = dict(tables_of(env))
         self._variables: dict[str, np.dtype[Any]] = {
@@ -206,8 +208,8 @@ class Tracer:
         for name, table in self._tables.items():
             vars(self._env)[name] = table.view(Table)
         for name, row in self._attributes.items():
-            names = element_names((), "attribute", name)
-            vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
+            symbols = loaded_rows(self._graph, (), "attribute", name, dtype=row.dtype)
+            vars(self._env)[name] = symbols
         self._env.inside.readings = symbolic_readings(
             self._env, self._graph, self._variables, judging
         )
@@ -240,7 +242,7 @@ class Tracer:
 
     def _told(self, kind: str) -> Any:
         """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
-        return loaded(self._graph, kind, np.array(None, object), np.bool_)
+        return loaded(self._graph, kind, (), lambda _: None, np.bool_)
 
     # Inputs.
 
