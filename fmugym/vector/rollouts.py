@@ -316,7 +316,7 @@ def _checked_array(space: Any, actions: Any) -> npt.NDArray[Any]:
     """The actions as an array of shape (n, horizon, ...) and of the type of the space."""
     if not is_array_space(space):
         raise ConfigError(f"the actions of {space} make no array; give rollout a policy instead")
-    array = array_of(actions)
+    array = actions if type(actions) is np.ndarray else array_of(actions)
     if array.ndim < 2 or array.shape[2:] != space.shape or not array.size:
         raise ConfigError(
             f"the actions have shape {array.shape}, expected (n, horizon"
