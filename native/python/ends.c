@@ -93,6 +93,9 @@ static void clear(Observed *o, PyObject **objects) {
 
     for (size_t i = 0; i < o->count; i++) {
         PyObject *object = objects[i];
+        if (object == Py_None) {
+            continue; /* nearly all of them */
+        }
         objects[i] = Py_NewRef(Py_None); /* first, because the end of an object may call back */
         if (object != NULL && Py_REFCNT(object) == 1 && o->number_of_spare < o->most &&
             maker_knows(&o->parts[0].maker, object, &memory)) {
