@@ -82,8 +82,9 @@ class SavingPool(RetryingPool):
 
     def _copies(self, indices: IndexArray) -> Copies | None:
         """Copy the states of all instances; None if some are not asked for, or cannot be copied."""
-        every = len(indices) == self.num_instances and np.all(self.statuses <= WARNING_CODE)
-        if self.save_method is not SaveMethod.COPY or not every:
+        if self.save_method is not SaveMethod.COPY or len(indices) != self.num_instances:
+            return None
+        if np.any(self.statuses > WARNING_CODE):
             return None
         try:
             return Copies(weakref.ref(self), self._copy_all(), np.array(indices))
