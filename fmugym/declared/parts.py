@@ -85,5 +85,6 @@ def read_term(entry: Entry) -> Term:
 
 
 def read_limits(entry: Entry, low: float = -np.inf, high: float = np.inf) -> Limits:
-    """Read ``min`` and ``max`` of a table, in the place of other limits."""
-    return entry.value.get("min", low), entry.value.get("max", high)
+    """Read ``min`` and ``max`` of a table, which may be missing, in the place of other limits."""
+    given = entry.value or {}
+    return given.get("min", low), given.get("max", high)

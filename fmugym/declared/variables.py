@@ -13,7 +13,7 @@ from fmugym.archive.variable import Variable
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
 from fmugym.declared.mistakes import ConsequenceError
-from fmugym.declared.parts import Limits
+from fmugym.declared.parts import Limits, read_limits
 from fmugym.declared.quantities import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -280,9 +280,8 @@ class TaskVariables:
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> Limits:
     """The limits of the task, or else those of the FMU."""
     own = (-math.inf, math.inf) if variable is None else variable.extremes
-    given, (low, high) = entry.value or {}, sorted(map(conversion, own))
-    low, high = given.get("min", low), given.get("max", high)
-    if not low < high and given.keys() & {"min", "max"}:
+    low, high = read_limits(entry, *sorted(map(conversion, own)))
+    if entry.value and not low < high and entry.value.keys() & {"min", "max"}:
         raise entry.error(f"min must be below max, got {low:g} and {high:g}")
     return low, high
 
