@@ -46,10 +46,10 @@ class Cart(fmugym.FMI2CSEnv):
 
 
 class Pushed(Cart):
-    space = spaces.MultiDiscrete([3, 2])
+    space = spaces.MultiDiscrete([3, 2], start=[-1, 4])
 
     def _get_inputs(self):
-        return 10.0 * (self.action[0] - 1.0) + 1.0 * self.action[1]
+        return 10.0 * self.action[0] + 1.0 * (self.action[1] - 4)
 
 
 def written(make_env, path, episodes=2, steps=40):
@@ -98,6 +98,13 @@ def test_units_times_and_names_are_those_of_the_plant(tmp_path):
     np.testing.assert_allclose(one.observations[:, 1], times / 0.05, rtol=1e-6)
     held = np.floor(times[:-1] / 0.05 + 1e-9) % 5  # newtons, until the next row
     np.testing.assert_allclose(one.actions[:, 0], held / 10, atol=1e-6)
+
+
+def test_a_tolerance_is_a_part_of_the_range_in_the_unit_of_the_fmu(tmp_path):
+    """At most 10 N can be written: 10.005 N is off by half a thousandth of the range."""
+    rows = ["time,x,x_dot,f [kN]", "0,0,0,0", "0.02,0,0,0.010005", "0.04,0,0,0"]
+    (one,) = play_log(log_of(tmp_path, "\n".join(rows)), Cart)
+    assert one.actions.ravel().tolist() == [0.0, 1.0]
 
 
 def test_the_fmu_is_not_loaded(tmp_path, monkeypatch):
