@@ -7,7 +7,7 @@ thermostat that leaves the battery alone is the measure.
     pip install '.[examples]' pythonfmu
     python examples/train_system.py --folder results
 
-writes the FMUs, the system as an SSP archive and as a picture, and the learning curve.
+writes the FMUs, a picture of the system, and the learning curve.
 """
 
 import argparse

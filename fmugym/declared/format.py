@@ -189,13 +189,13 @@ _LIMITS: Final = {
     "min": Key(NUMBER, "Lower limit for the observation space.", None, "no limit"),
     "max": Key(NUMBER, "Upper limit for the observation space.", None, "no limit"),
 }
-_DESCRIPTION: Final = {"description": Key(TEXT, "A text for people.")}
+_DESCRIPTION: Final = {"description": Key(TEXT, "A description for readers.")}
 
 
 # Variables.
 
 DEVICE: Final = {
-    "delay": Key(POSITIVE_TIME, "The value comes this late; a multiple of the time step."),
+    "delay": Key(POSITIVE_TIME, "How late the value arrives; a multiple of the time step."),
     "bias": Key(
         Kind(_bias, _DRAWN),
         "This is added: a number, or one that is drawn in each episode from a uniform or normal "
@@ -264,8 +264,8 @@ VARIABLE: Final = Table(
         ),
         "min_on": Key(
             POSITIVE_TIME,
-            "The time that an action stays on (other than 0) at least. Until then the old value "
-            "stays.",
+            "The shortest time for which an action stays on (other than 0). Until then the old "
+            "value stays.",
         ),
         "min_off": Key(POSITIVE_TIME, "The time that an action stays off at least."),
         "sample": Key(
@@ -332,8 +332,9 @@ AGENT: Final = Table(
         ),
         "history": Key(
             HISTORY,
-            '`{ of = ["T", "u"], length = "2h" }`: the values before the present one, the latest '
-            "first. That of an action begins with the last action.",
+            '`{ of = ["T", "u"], length = "2h" }`: the values before the present one, of variables, '
+            "actions, data and schedules, the latest first. That of an action begins with the last "
+            "action.",
         ),
         "rescale": Key(FLAG, "Whether actions go from -1 to 1 for `min` to `max`.", False),
         "normalize": Key(

@@ -21,7 +21,7 @@ from fmugym.declared.mathematics import clip, maximum
 from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.quantities import nearest_steps, steps_in
 from fmugym.declared.variables import TaskVariable
-from fmugym.errors import unknown_name
+from fmugym.errors import ConfigError, unknown_name
 from fmugym.task.future import Lookup
 from fmugym.vector.hooks.graph import Graph
 
@@ -189,6 +189,8 @@ class Naming:
             if name in others:
                 return others[name]
             value = self.value_of(name, moment)
+            if value is None and name in BUILT_IN:
+                raise ConfigError(f"{name!r} is known in 'reward', 'costs' and 'truncated' only")
             if value is None:
                 self.declared.variables.require_unhidden(name)
             return value

@@ -149,7 +149,8 @@ async def _certificate_in(path: Path) -> Any:
 async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback; see ``modbus.serve``.
 
-    Where the plant encrypts, the server makes a certificate of its own, and takes all clients.
+    Where the plant encrypts, the server makes a certificate of its own. It takes no other client
+    than the one whose certificate the plant names, if it names one.
     """
     server = Server()
     await server.init()

@@ -53,7 +53,7 @@ SYSTEM: Final = Table(
             Entries(TEXT), "Units of the system's own inputs, outputs and parameters by name.", {}
         ),
         "name": Key(TEXT, "Of the system.", "system"),
-        "description": Key(TEXT, "A text for people.", ""),
+        "description": Key(TEXT, "A description for readers.", ""),
         "step_size": Key(
             POSITIVE,
             "Default communication step size.",

@@ -109,11 +109,14 @@ def _shared(key: Any, open_it: Callable[[], FMU]) -> FMU:
 
 
 def _open_system(system: FMUSystem, config: EnvConfig) -> FMU:
-    given = {"preload": config.foreign.preload, "interface": config.interface}
-    for key, value in given.items():
+    given = {
+        "preload": (config.foreign.preload, "the FMU of a component"),
+        "interface": (config.interface, "a component"),
+    }
+    for key, (value, owner) in given.items():
         if value:
             raise ConfigError(
-                f"config key {key!r} is for a single FMU; give it to a component of {system.name!r}"
+                f"config key {key!r} is for a single FMU; give it to {owner} of {system.name!r}"
             )
     fmu = system.as_fmu(config.foreign.probe_timeout)
     fmu.description.resized(structural_values(fmu.description, config.model_parameters))

@@ -1,6 +1,6 @@
 """What all fuzzing programs share: their command line, the running of cases, and the report.
 
-    python tests/fuzz_PROGRAM.py --count 4000 --seed 0 [--first N]
+    python tests/tools/fuzz_PROGRAM.py --count 4000 --seed 0 [--first N]
 
 A case ends in one of these ways:
 

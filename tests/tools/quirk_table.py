@@ -1,7 +1,7 @@
 """Useful FMUs that break one promise each, and what fmugym does about it.
 
-The tests expect it, and tests/zoo/README.md tells it: ``python quirk_table.py`` prints its table.
-The FMUs are those of ``zoo/quirks.c``.
+The tests expect it, and tests/zoo/README.md tells it: ``python tests/tools/quirk_table.py`` prints
+its table. The FMUs are those of ``zoo/quirks.c``.
 """
 
 import functools

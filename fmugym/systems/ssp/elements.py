@@ -212,7 +212,7 @@ def ignored(root: Any) -> list[str]:
 
 
 def _read_own(xml: Any) -> dict[str, str]:
-    """What fmugym has written about an element that SSP has no words for."""
+    """What earlier versions of fmugym have written about an element, as SSP has no words for it."""
     for annotation in children(xml, "Annotations/Annotation"):
         if annotation.get("type") == OWN_ANNOTATION and len(annotation):
             return dict(annotation[0].attrib)
