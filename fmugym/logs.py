@@ -200,10 +200,9 @@ def play_log(
     The log is read at the communication points of the task. Reals are interpolated between its
     rows; everything else, and inputs, hold their value until the next row. The actions are those
     that make the task write the logged inputs. Rewards, observations and ends are the task's own.
-    Where an episode ends, the next one begins with the row that follows. Where an input or output
-    was not measured, an episode is truncated. So is the last one by the end of the log. An episode
-    of the log shorter than one time step is left out. A start time that the task draws is that of
-    the log.
+    Where an episode ends, the next one begins in the same row. Where an input or output was not
+    measured, an episode is truncated. So is the last one by the end of the log. An episode of the
+    log shorter than one time step is left out. A start time that the task draws is that of the log.
 
     Args:
         log: The log. It needs a column for each input and output of the task.

@@ -10,10 +10,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome"]
+__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome", "most_steps_of"]
 
 MOST_ENVS: Final = 256
 """As many environments step together, unless the caller says less: more would hardly be faster."""
@@ -23,6 +24,11 @@ MOST_STEPS: Final = 10_000
 
 Merit = tuple[float, float]
 """How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
+
+
+def most_steps_of(env: FMUEnv) -> int | None:
+    """The limit of steps of an episode, by the config or the registered id; None for no limit."""
+    return env.config.max_episode_steps or getattr(env.spec, "max_episode_steps", None)
 
 
 class CeilingError(FMUGymError):

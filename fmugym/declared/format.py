@@ -332,9 +332,9 @@ AGENT: Final = Table(
         ),
         "history": Key(
             HISTORY,
-            '`{ of = ["T", "u"], length = "2h" }`: the values before the present one, of variables, '
-            "actions, data and schedules, the latest first. That of an action begins with the last "
-            "action.",
+            '`{ of = ["T", "u"], length = "2h" }`: the values of variables, actions, data and '
+            "schedules before the present one, the latest first. That of an action begins with the "
+            "last action.",
         ),
         "rescale": Key(FLAG, "Whether actions go from -1 to 1 for `min` to `max`.", False),
         "normalize": Key(

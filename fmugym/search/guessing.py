@@ -8,6 +8,8 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
+from fmugym.baselines.arena import most_steps_of
+
 __all__ = ["both_controllers", "guessed_controllers"]
 
 _DECADES: Final = 100.0
@@ -31,7 +33,7 @@ def guessed_controllers(document: Mapping[str, Any], env: Any) -> list[str]:
         return []
     widths = dict(zip(names, (seen.high - seen.low).tolist(), strict=True))
     reach = (space.high - space.low).item()
-    longest = (env.config.max_episode_steps or 100) * env.config.time_step
+    longest = (most_steps_of(env) or 100) * env.config.time_step
     found: set[str] = set()
     for of, setpoint in _pairs(document, env):
         known = abs(setpoint) if isinstance(setpoint, float) else 0.0

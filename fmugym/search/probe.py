@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.arena import MOST_STEPS, Arena, most_steps_of
 from fmugym.baselines.parsing import plans_ahead
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -77,7 +77,7 @@ class Probe:
             require_numbers(env.observation_space, env.action_space)
             policy, task = Policy(None).bind(env), task_of(env)
             guesses = guessed_controllers(task, env)
-            length = env.config.max_episode_steps or getattr(env.spec, "max_episode_steps", None)
+            length = most_steps_of(env)
             limits = dict(getattr(env, "cost_limits", {}))
         declared = [
             Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")

@@ -63,7 +63,11 @@ def add_train(commands: Commands) -> None:
     command = add_command(commands, "train", _train, text)
     add_task(command)
     command.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="a new one")
-    command.add_argument("--minutes", type=float, help="of the search, without its test; default 1")
+    command.add_argument(
+        "--minutes",
+        type=float,
+        help="of the search, without its test; default 1, or no limit with --rounds",
+    )
     command.add_argument(
         "--rounds", type=int, help="that the search ends with: repeats an earlier one"
     )

@@ -104,7 +104,7 @@ EXAMPLES: Final = {
     ),
     "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
     "serve": ("fmugym serve house.toml --controller thermostat --speed 9000 --steps 50",),
-    "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 1",),
+    "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 10",),
     "bench": ("fmugym bench task.toml --seconds 0.1",),
     "demo": ("fmugym demo --output demo.png",),
 }

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from fmugym.baselines.arena import most_steps_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
@@ -125,7 +126,7 @@ def _play(
 
 def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
     """How many steps the episodes take at most; None if only ``--steps`` limits them."""
-    limit = env.config.max_episode_steps
+    limit = most_steps_of(env)
     return None if limit is None else min(limit, arguments.steps) * int(arguments.episodes)
 
 

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
+from fmugym.baselines.arena import most_steps_of
 from fmugym.baselines.controller import FloatArray
 from fmugym.declared import Task
 from fmugym.distributions import draw, is_distribution
@@ -102,7 +103,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         recommended = _recommended(env, first.step_time, hooks, findings)
         others = [*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards)]
         replay = Replay.of(env)
-        steps = None if first.terminated else env.config.max_episode_steps
+        steps = None if first.terminated else most_steps_of(env)
     more, advices = _repeated(replay, steps)
     advices += others
     checks = {one.check for one in more}
@@ -495,9 +496,9 @@ def _own_name(env: FMUEnv, name: str) -> str:
 
 
 def _of_length(env: FMUEnv) -> Finding:
-    steps, config = env.config.max_episode_steps, env.config
-    if steps is not None or config.stop_time is not None:
-        what = f"at most {steps} steps" if steps is not None else f"until t = {config.stop_time} s"
+    steps, stop_time = most_steps_of(env), env.config.stop_time
+    if steps is not None or stop_time is not None:
+        what = f"at most {steps} steps" if steps is not None else f"until t = {stop_time} s"
         return Finding("ok", "length", f"an episode takes {what}")
     return Finding(
         "warning",
