@@ -86,7 +86,7 @@ def _values(variable, bounds, fraction):
 
 def play_fmpy(path, config):
     """All episodes of all environments; the first environment's come first."""
-    description = fmugym.FMU(path).description
+    description = fmugym.FMU(path, interface="co_simulation").description
     times = {"start_time": description.start_time, "tolerance": description.tolerance}
     names = config["model_input_names"]
 
