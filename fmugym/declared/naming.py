@@ -190,7 +190,8 @@ class Naming:
                 return others[name]
             value = self.value_of(name, moment)
             if value is None and name in BUILT_IN:
-                raise ConfigError(f"{name!r} is known in 'reward', 'costs' and 'truncated' only")
+                places = "'reward', 'costs', 'kpis' and 'truncated'"
+                raise ConfigError(f"{name!r} is known in {places} only")
             if value is None:
                 self.declared.variables.require_unhidden(name)
             return value

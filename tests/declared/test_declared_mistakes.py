@@ -93,7 +93,7 @@ HOUSE = """
 SYSTEM = """
     time_step = "1s"
     reward = "-anglee**2"                            #! 'anglee'.*'angle'
-    terminated = "done"                              #! 'done' is known in 'reward', 'costs'
+    terminated = "done"                              #! 'done' is known in .* 'kpis' and
 
     [system]
     mastr = "jacobi"                                 #! 'master'

@@ -159,12 +159,12 @@ class TestEnvironments:
             )
 
     def test_keys_for_a_single_fmu(self):
-        for key, given in (
-            ("interface", {"interface": "co_simulation"}),
-            ("preload", {"foreign": {"preload": ["/x.so"]}}),
+        for fact, given in (
+            ("'interface'.* to a component", {"interface": "co_simulation"}),
+            ("'preload'.* to the FMU of a component", {"foreign": {"preload": ["/x.so"]}}),
         ):
             config = {"model_input_names": [], "model_output_names": ["warmth"], **given}
-            with pytest.raises(ConfigError, match=key):
+            with pytest.raises(ConfigError, match=fact):
                 PlainEnv(two_houses(), config)
 
 
