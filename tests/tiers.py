@@ -73,6 +73,7 @@ SLOW_MODULES = {
 """Programs that train, build, measure, or make cases by the hundred."""
 
 EVERY = {
+    "test_golden_tasks": 1,
     "test_hostile_archive": 19,
     "test_licences": 23,
     "test_neighbours": 7,
@@ -88,6 +89,7 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_golden_tasks": 1,
     "test_export_search": 3,
     "test_declared_physical": 3,
     "test_declared_weather": 3,
@@ -123,6 +125,9 @@ EVERY_OF_OTHERS_IN_CI = 4
 """For the modules that are not in ``EVERY_IN_CI``; their parameters take turns."""
 
 SLOW_TESTS = (
+    "test_golden_tasks.py::test_an_onnx",
+    "test_golden_tasks.py::test_is_as_it_was[exported",
+    "test_golden_tasks.py::test_is_as_it_was[training",
     "test_plant.py::TestFaults",
     "test_plant.py::TestPredictions",
     "test_plant.py::TestData::test_a_file",
