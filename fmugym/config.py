@@ -284,6 +284,12 @@ class EnvConfig:
         "the [range](config.md#ranges) of parameters and start values.",
         {},
     )
+    units: Mapping[str, str] = key(
+        Entries(TEXT),
+        "Units of the FMU's variables by name, for those to which the FMU gives none or a wrong "
+        "one.",
+        {},
+    )
     on_fault: str = key(option(*ON_FAULT), "What a failed step does.", "truncate")
     fault_retries: int = key(
         Kind(

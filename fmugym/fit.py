@@ -21,7 +21,7 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 
-from fmugym.archive.units import conversion_between
+from fmugym.archive.units import conversion_of
 from fmugym.archive.variable import Variable
 from fmugym.env import inner_env
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -187,7 +187,7 @@ class _Plant:
         if ends is None:
             low, high = sorted((value / _AROUND, value * _AROUND))
         else:
-            conversion = conversion_between(variable.unit, unit, units)
+            conversion = conversion_of(variable, unit, units)
             low, high = sorted(map(conversion.inverse, ends))
         low, high = max(low, variable.minimum), min(high, variable.maximum)
         if not low < high:

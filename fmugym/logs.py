@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.units import Conversion, conversion_between
+from fmugym.archive.units import Conversion, conversion_of
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, require_regular
 from fmugym.declared import Task
@@ -365,9 +365,9 @@ class Columns:
         for column in log.columns:
             name, unit = declared_as(env, columns.get(column, column))
             if name in self._variables:
-                own, units = self._variables[name].unit, env.fmu.description.units
+                own, units = self._variables[name], env.fmu.description.units
                 try:
-                    to_log = conversion_between(own, log.units.get(column) or unit, units)
+                    to_log = conversion_of(own, log.units.get(column) or unit, units)
                     self._from[name] = column, to_log
                 except ConfigError as error:
                     raise ConfigError(f"column {column!r} of the log: {error}") from None

@@ -158,6 +158,8 @@ SLOW_TESTS = (
     "test_examples_mpc.py::test_the_program_draws",
     "test_executable.py::TestMissingLibraries::test_beside",
     "test_fit.py::TestHouse",
+    "test_declared_units.py::TestConversion::test_of_ranges",
+    "test_declared_units.py::test_the_command_line",
     "test_gate.py::test_every_row",
     "test_gate.py::test_trees_are",
     "test_gate.py::test_another_package",

@@ -255,6 +255,7 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         initial=_initial(source),
         start=source.start,
         unit=_inherited(source, "unit", str) or None,
+        relative=_is_relative(source, element),
         minimum=_bound(source, "min", -math.inf),
         maximum=_bound(source, "max", math.inf),
         nominal=_nominal(source),
@@ -339,6 +340,14 @@ def _inherited(source: Any, attribute: str, convert: Callable[[str], Any]) -> An
     if value is None and source.declaredType is not None:
         value = getattr(source.declaredType, attribute)
     return None if value is None else convert(value)
+
+
+def _is_relative(source: Any, element: Any) -> bool:
+    """Whether a variable or its type is relative; FMPy does not find it at variables."""
+    for one in (element, *element):  # before FMI 3.0 it stands below the variable
+        if one.get("relativeQuantity") is not None:
+            return one.get("relativeQuantity") in {"true", "1"}
+    return bool(getattr(source.declaredType, "relativeQuantity", False))
 
 
 def _bound(source: Any, attribute: str, default: float) -> float:

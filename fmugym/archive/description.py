@@ -294,6 +294,18 @@ class ModelDescription:
             model_exchange=None if solved is None else solved.resized(variables),
         )
 
+    def with_units(self, units: Mapping[str, str]) -> ModelDescription:
+        """The same FMU with other units of its variables.
+
+        Args:
+            units: Units by the names of scalars and arrays.
+
+        Raises:
+            ConfigError: If there is no such variable.
+        """
+        changed = {name: replace(self.variable(name), unit=unit) for name, unit in units.items()}
+        return replace(self, variables={**self.variables, **changed})
+
     def _checked_size(self, name: str, size: Any) -> int:
         variable, number = self.variable(name), _whole(size)
         if variable.causality != "structuralParameter" or variable.type != "UInt64":

@@ -40,7 +40,7 @@ from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.archive.variable import Variable
 from fmugym.checks import KnownArguments, check_mapping, check_number, check_option, check_path
-from fmugym.errors import ConfigError, FMULoadError, printable, shown
+from fmugym.errors import ConfigError, FMULoadError, plain, printable, shown, warn_once
 from fmugym.signals import ordinary
 from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
@@ -173,6 +173,29 @@ class FMU(KnownArguments):
         """The same FMU once more, which is not read again, with a temporary folder of its own."""
         other = copy.copy(self)
         other._folder, other._remove_folder = None, None
+        return other
+
+    def with_units(self, units: Mapping[str, str]) -> FMU:
+        """The same FMU with other units of its variables.
+
+        The log tells once in a process which units of the FMU they replace.
+
+        Args:
+            units: Units by the names of scalars and arrays.
+
+        Raises:
+            ConfigError: If there is no such variable.
+        """
+        other = self.again()
+        other.description = self.description.with_units(units)
+        for name, unit in units.items():
+            own = self.variable(name).unit
+            if own not in (None, unit):
+                warn_once(
+                    logger,
+                    f"{self.path.name}: the unit of {plain(name)} is {plain(unit)}, as the task "
+                    f"says, not {plain(own)}, as the FMU says",
+                )
         return other
 
     @property

@@ -10,10 +10,17 @@ from functools import cache
 from typing import Any, Final, TypeVar
 
 from fmugym.archive.description import BASE_UNITS, Unit
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 
-__all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link"]
+__all__ = [
+    "IDENTITY",
+    "Conversion",
+    "conversion_between",
+    "conversion_of",
+    "conversion_of_link",
+]
 
 _Value = TypeVar("_Value")
 """A number, or an object that calculates like one."""
@@ -42,8 +49,33 @@ class Conversion:
         """The conversion that does another one first."""
         return Conversion(self.factor * first.factor, self(first.offset))
 
+    def of_differences(self, are_meant: bool = True) -> Conversion:
+        """The conversion of differences of values, which has no offset.
+
+        Args:
+            are_meant: Whether differences are meant; else this is the conversion of values.
+        """
+        return Conversion(self.factor) if are_meant else self
+
 
 IDENTITY: Final = Conversion()
+
+
+def conversion_of(
+    variable: Variable, wanted: str | None, definitions: Mapping[str, Unit]
+) -> Conversion:
+    """Find the conversion from the unit of a variable of the FMU, which may be a difference.
+
+    Args:
+        variable: The variable.
+        wanted: The unit to convert to; None for the variable's own.
+        definitions: The units that the FMU defines.
+
+    Raises:
+        ConfigError: If one unit is unknown, or they measure different quantities.
+    """
+    found = conversion_between(variable.unit, wanted, definitions)
+    return found.of_differences(variable.relative)
 
 
 def conversion_between(

@@ -101,6 +101,7 @@ class Variable:
         type: The standard's own name: ``Real``, ``Float64``, ``Int32``, ...
         start: The start value as the XML has it.
         minimum, maximum: Infinite where neither the variable nor its declared type gives a number.
+        relative: Whether it is a difference, whose unit is converted without an offset.
         nominal: None where neither the variable nor its declared type gives a finite number.
         items: Names and values of an enumeration. Of a String, the texts that it may get and their
             numbers; see ``fmugym.archive.texts``.
@@ -130,6 +131,7 @@ class Variable:
     initial: str | None
     start: str | None = None
     unit: str | None = None
+    relative: bool = False
     minimum: float = -math.inf
     maximum: float = math.inf
     nominal: float | None = None

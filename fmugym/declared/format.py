@@ -236,6 +236,13 @@ VARIABLE: Final = Table(
             None,
             "the FMU's",
         ),
+        "fmu_unit": Key(
+            TEXT,
+            "Unit that the FMU [means](task-file.md#units), for one that does not say it or says "
+            "a wrong one.",
+            None,
+            "the FMU's",
+        ),
         "min": Key(
             NUMBER,
             "Lower limit for the spaces, and for the [range](config.md#ranges) of parameters and "
@@ -718,6 +725,7 @@ _OF_SECTIONS: Final = {
     "samplings": "give variables the key 'sample' in [variables]",
     "episode_variables": "give them in [memory] or [setpoints]",
     "bounds": "give variables 'min' and 'max' in [variables]",
+    "units": "give variables the key 'fmu_unit' in [variables]",
     "max_episode_steps": "it follows from 'episode_length', which stands above [config]",
     "positive_reward": "give an expression for 'reward'",
     "negative_reward": "give an expression for 'reward'",

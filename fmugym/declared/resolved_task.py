@@ -212,6 +212,7 @@ class ResolvedTask:
             },
             "episode_variables": self._variables(),
             "bounds": bounds_of(self._naming),
+            "units": variables.units,
             "samplings": samplings_of(self._naming),
         }
 

@@ -7,8 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import numpy as np
+
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.units import IDENTITY, Conversion, conversion_between
+from fmugym.archive.units import IDENTITY, Conversion, conversion_of
 from fmugym.archive.variable import Variable
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
@@ -110,11 +112,15 @@ class TaskVariables:
     Args:
         root: The table of all keys.
         description: The FMU's model description.
+
+    Attributes:
+        units: Units of the FMU that the task gives, by the names of variables of the FMU.
     """
 
     def __init__(self, root: Entry, description: ModelDescription) -> None:
-        self._root, self._description = root, description
-        self._entries = root.child("variables").items()
+        self._root, self._entries = root, root.child("variables").items()
+        self.units = _units_in_fmu(self._entries, description)
+        self._description = description.with_units(self.units)
         self._variables: dict[str, TaskVariable] = {}
         for name, entry in self._entries.items():
             with entry.noting():
@@ -213,8 +219,8 @@ class TaskVariables:
         if unit is None or variable.in_fmu is None:
             return variable
         with entry.placing():
-            own, units = variable.in_fmu.unit, self._description.units
-            return replace(variable, conversion=conversion_between(own, unit, units))
+            conversion = conversion_of(variable.in_fmu, unit, self._description.units)
+            return replace(variable, conversion=conversion)
 
     def check_input(self, entry: Entry, variable: TaskVariable) -> None:
         """Check that a variable can be written before each step; one without the FMU's name can.
@@ -258,9 +264,11 @@ class TaskVariables:
         own = None if in_fmu is None else in_fmu.unit
         if sample == "integral" and own is not None:
             own = f"({own}).s"
-        unit = given.get("unit", own)
+        unit, conversion = given.get("unit", own), IDENTITY
         with entry.child("unit").placing():
-            conversion = conversion_between(own, unit, self._description.units)
+            if in_fmu is not None:
+                units = self._description.units
+                conversion = conversion_of(replace(in_fmu, unit=own), unit, units)
         limited = None if sample == "integral" else in_fmu
         if "delta" in given and "levels" in given:
             raise entry.error("an action has either 'levels' or 'delta'")
@@ -275,6 +283,38 @@ class TaskVariables:
             device=read_device(entry),
             **{key: given[key] for key in _PLAIN if key in given},
         )
+
+
+def _units_in_fmu(entries: Mapping[str, Entry], description: ModelDescription) -> dict[str, str]:
+    """The units that the task gives to variables of the FMU, by their names there.
+
+    All aliases of a variable, and its own name, go by the same one.
+    """
+    found: dict[str, str] = {}
+    for alias, entry in entries.items():
+        unit = entry.child("fmu_unit")
+        with unit.noting():
+            if unit.value is not None:
+                own = _with_unit(alias, entry, description)
+                if own is not None and found.setdefault(own.name, unit.value) != unit.value:
+                    raise unit.error(
+                        f"{own.name!r} of the FMU has one unit: expected that of another of its "
+                        f"names, {shown(found[own.name])}, got {shown(unit.value)}"
+                    )
+    return found
+
+
+def _with_unit(alias: str, entry: Entry, description: ModelDescription) -> Variable | None:
+    """The scalar or array to which a task gives a unit; None if its name has a mistake."""
+    name = entry.child("name").value
+    variable = description.find(alias if name is None else name)
+    if variable is None and name is None:
+        raise entry.child("fmu_unit").error(f"{alias!r} is no variable of the FMU")
+    if variable is not None and not variable.is_number:
+        raise entry.child("fmu_unit").error(
+            f"{variable.name!r} is of type {variable.type}, which has no unit"
+        )
+    return variable if variable is None or variable.array is None else variable.array
 
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> Limits:
@@ -311,7 +351,7 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
             f"{in_fmu.variability} {in_fmu.causality}"
         )
     if in_fmu.shape:
-        return _array_start(in_fmu, entry)
+        return _array_start(variable, entry)
     value, is_text = entry.value, bool(in_fmu.items) or in_fmu.kind == "string"
     with entry.placing():
         if not (isinstance(value, str) and is_text):
@@ -322,13 +362,24 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
         return within(in_fmu, checked(in_fmu, value))
 
 
-def _array_start(variable: Variable, entry: Entry) -> Any:
+def _array_start(variable: TaskVariable, entry: Entry) -> Any:
     """The value of an array: nested lists, or one value for all elements, in the FMU's unit."""
+    in_fmu, conversion = variable.fmu_variable, variable.conversion
     with entry.placing():
-        parts = spread(variable.name, variable.elements, entry.value)
-        for element, part in zip(variable.elements, parts, strict=True):
+        parts = spread(in_fmu.name, in_fmu.elements, entry.value)
+        if conversion != IDENTITY:
+            numbers = [number_or_distribution(entry.name, part) for part in parts]
+            parts = [_in_unit_of_fmu(conversion, number) for number in numbers]
+        for element, part in zip(in_fmu.elements, parts, strict=True):
             within(element, checked(element, part))
-    return entry.value
+    return entry.value if conversion == IDENTITY else _nested(parts, in_fmu.shape)
+
+
+def _nested(parts: Sequence[Any], shape: tuple[int, ...]) -> Any:
+    """The elements of an array in row-major order as nested lists."""
+    array = np.empty(len(parts), object)
+    array[:] = parts
+    return array.reshape(shape).tolist()
 
 
 def _in_unit_of_fmu(conversion: Conversion, value: Any) -> Any:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fmugym.archive.units import IDENTITY, Conversion, conversion_between
+from fmugym.archive.units import IDENTITY, Conversion, conversion_between, conversion_of
 from fmugym.archive.variable import Variable
 from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
@@ -144,7 +144,7 @@ def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
     spec = env.inside.spec
     for one in (*spec.outputs, *spec.inputs):
         if one.name == own:
-            to_task = conversion_between(one.unit, unit, env.fmu.description.units)
+            to_task = conversion_of(one, unit, env.fmu.description.units)
             sampling = "median" if one in spec.inputs else one.sampling
             return {"own": own, "to_task": to_task, "sampling": sampling}
     return {}
@@ -158,5 +158,7 @@ def _tag(env: TaskEnv, name: str, entry: Entry, unit: str, **others: Any) -> Tag
         raise entry.error(f"the protocol {protocol!r} needs the key {key!r}")
     with entry.placing():
         own = conversion_between(given.get("unit"), unit or None, env.fmu.description.units)
+    in_fmu = env.fmu.description.find(others.get("own", ""))
+    own = own.of_differences(in_fmu is not None and in_fmu.relative)
     raw = Conversion(given["scale"], given["offset"])
     return Tag(name, entry, given, own.after(raw), given.get("count", 1), **others)

@@ -11,6 +11,7 @@ import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena, most_steps_of
 from fmugym.baselines.parsing import plans_ahead
+from fmugym.declared.likely_units import require_units
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import require_numbers
@@ -76,6 +77,7 @@ class Probe:
         with closing(make_env()) as env:
             require_numbers(env.observation_space, env.action_space)
             policy, task = Policy(None).bind(env), task_of(env)
+            require_units(env)
             guesses = guessed_controllers(task, env)
             length = most_steps_of(env)
             limits = dict(getattr(env, "cost_limits", {}))

@@ -255,6 +255,7 @@ def _end(connection: Connection, port: Port, own: _DefinedUnit, other: _DefinedU
             raise ConfigError(
                 f"{connection}: {error}; give it a gain and convert_units=False"
             ) from None
+    conversion = conversion.of_differences(port.variable.relative)
     change = Conversion(connection.gain, connection.offset).after(conversion)
     return End(port.component.name, port.variable.name, change.factor, change.offset)
 

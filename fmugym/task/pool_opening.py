@@ -74,6 +74,16 @@ def open_fmu(
         ConfigError: If an argument is invalid.
         FMULoadError: If the file is missing or not a valid FMU.
     """
+    fmu = _opened(cls, path, config, interface)
+    return fmu.with_units(config.units) if config.units else fmu
+
+
+def _opened(
+    cls: type,
+    path: str | os.PathLike[str] | FMUSystem,
+    config: EnvConfig,
+    interface: str | None,
+) -> FMU:
     limits, timeout = config.foreign.archive_limits, config.foreign.probe_timeout
     if isinstance(path, FMUSystem):
         return _shared((path, timeout), lambda: _open_system(path, config))

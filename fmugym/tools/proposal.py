@@ -19,6 +19,7 @@ import numpy as np
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
+from fmugym.declared.likely_units import likely_units
 from fmugym.errors import ConfigError, FMULoadError, plain
 from fmugym.repair.stand_in import replaceable
 from fmugym.search.guessing import both_controllers
@@ -79,8 +80,9 @@ class Proposal:
     """
 
     def __init__(self, fmu: FMU, folder: Path | None = None) -> None:
-        self._fmu, self._folder = fmu, folder
-        self._skeleton = Skeleton(fmu)
+        self._guessed = likely_units(fmu.description)
+        self._fmu, self._folder = fmu.with_units(self._guessed), folder
+        self._skeleton = Skeleton(self._fmu)
         if not self._actions:
             raise ConfigError(
                 f"{fmu.path.name} has no numeric input or tunable parameter that an agent could "
@@ -129,6 +131,12 @@ class Proposal:
             yield (
                 f"the FMU gives no limits of input {variable.name!r}: those in the file are a guess"
             )
+        used = {*map(_scalar_or_array, [*self._actions, *self._skeleton.outputs])}
+        for name in used & self._guessed.keys():
+            yield (
+                f"the FMU gives no unit of {name!r}, which looks like {self._guessed[name]}: check "
+                "'fmu_unit'"
+            )
         if not self._skeleton.has_step_size:
             yield "the FMU gives no step size that fits its default experiment; check 'time_step'"
         if not self._skeleton.has_duration:
@@ -173,9 +181,19 @@ class Proposal:
         for variable in self._actions:
             yield self._action(variable)
         for variable in self._skeleton.outputs:
-            if self._aliases[variable.name] != variable.name:
-                name = _quoted(variable.name)
-                yield f"{self._aliases[variable.name]} = {{ name = {name} }}{remark(variable)}"
+            parts = self._parts(variable, self._aliases[variable.name])
+            if parts:
+                yield f"{self._aliases[variable.name]} = {_table(parts)}{self._remark(variable)}"
+
+    def _parts(self, variable: Variable, alias: str) -> list[str]:
+        """What the task has to say of any variable: its name in the FMU, and its unit there."""
+        unit = self._guessed.get(_scalar_or_array(variable))
+        name = [f"name = {_quoted(variable.name)}"] if alias != variable.name else []
+        return name if unit is None else [*name, f"fmu_unit = {_quoted(unit)}"]
+
+    def _remark(self, variable: Variable) -> str:
+        is_guessed = _scalar_or_array(variable) in self._guessed
+        return "  # TODO: the unit is a guess" if is_guessed else remark(variable)
 
     def _results(self) -> Iterator[str]:
         """Locals as comments: for many an exporter, the interesting variables are no outputs."""
@@ -187,20 +205,19 @@ class Proposal:
         taken = {self._setpoint, *self._aliases.values()}
         for variable in found[:_MOST_RESULTS]:
             taken.add(alias := _free_alias(variable.name, taken))
-            yield f"# {alias} = {{ name = {_quoted(variable.name)} }}{remark(variable)}"
+            parts = self._parts(variable, alias) or [f"name = {_quoted(variable.name)}"]
+            yield f"# {alias} = {_table(parts)}{self._remark(variable)}"
         if len(found) > _MOST_RESULTS:
             yield f"# {len(found) - _MOST_RESULTS} more are listed by: fmugym info --all"
 
     def _action(self, variable: Variable) -> str:
-        parts = []
-        if self._aliases[variable.name] != variable.name:
-            parts.append(f"name = {_quoted(variable.name)}")
+        parts = self._parts(variable, self._aliases[variable.name])
         if needs_bounds(variable):
             low, high = guessed_bounds(variable)
             parts.append(f"min = {low!r}, max = {high!r}")
         todo = "  # TODO: the limits are a guess" if needs_bounds(variable) else ""
-        text = f"{{ {', '.join(parts)} }}" if parts else "{}"
-        return f"{self._aliases[variable.name]} = {text}{todo or remark(variable)}"
+        note = todo or self._remark(variable)
+        return f"{self._aliases[variable.name]} = {_table(parts)}{note}"
 
     def _agent(self) -> Iterator[str]:
         yield "[agent]"
@@ -264,6 +281,16 @@ class Proposal:
 def preload_line(paths: Sequence[str]) -> str:
     """The line that names libraries, for the table ``[foreign]`` of a task file."""
     return f"preload = [{', '.join(map(_quoted, paths))}]"
+
+
+def _scalar_or_array(variable: Variable) -> str:
+    """The name of a scalar, or of the array of an element, which has the unit."""
+    return variable.name if variable.array is None else variable.array.name
+
+
+def _table(parts: Sequence[str]) -> str:
+    """An inline table of TOML."""
+    return f"{{ {', '.join(parts)} }}" if parts else "{}"
 
 
 def _is_result(variable: Variable) -> bool:

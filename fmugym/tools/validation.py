@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,7 +19,8 @@ from gymnasium import spaces
 
 from fmugym.baselines.arena import most_steps_of
 from fmugym.baselines.controller import FloatArray
-from fmugym.declared import Task
+from fmugym.declared import Task, TaskEnv
+from fmugym.declared.likely_units import Misreading, misreadings
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
@@ -219,7 +220,10 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield from _of_parameters(env)
     yield from _of_inputs(env)
     yield _of_reward(first, [episode for pair in pairs.values() for episode in pair])
-    yield from _of_observations(env, first, _play(env, env.action_space.sample, seed=1))
+    misread = _misread(env)
+    yield from _of_units(misread)
+    second = _play(env, env.action_space.sample, seed=1)
+    yield from _of_observations(env, first, second, misread)
     yield _of_length(env)
     yield _of_export(env)
 
@@ -427,12 +431,39 @@ def _document(env: FMUEnv) -> Mapping[str, Any]:
     return task.document if isinstance(task, Task) else {}
 
 
-def _of_observations(env: FMUEnv, first: _Episode, second: _Episode) -> Iterator[Finding]:
+def _misread(env: FMUEnv) -> list[Misreading]:
+    """The variables of a declared task whose values seem to be in another unit."""
+    if not isinstance(env, TaskEnv):
+        return []
+    quantities, rows = quantities_of(env), list[Any]()
+
+    def choose() -> Any:
+        rows.append([float(value) for value in quantities.read(env)])
+        return env.action_space.sample()
+
+    env.action_space.seed(0)
+    _play(env, choose)
+    columns = zip(quantities.all, np.transpose(rows), strict=True)
+    seen = {one.name: values[np.isfinite(values)].tolist() for one, values in columns}
+    return list(misreadings(env, seen))
+
+
+def _of_units(misread: Sequence[Misreading]) -> Iterator[Finding]:
+    """Tell what the FMU seems to mean by numbers to which it gives no unit."""
+    for one in misread:
+        verdict = "error" if one.contradicts else "warning"
+        yield Finding(verdict, "units", one.text, f"write {one.line} under [variables]")
+
+
+def _of_observations(
+    env: FMUEnv, first: _Episode, second: _Episode, misread: Sequence[Misreading]
+) -> Iterator[Finding]:
     space, seen = env.observation_space, first.observations
     if not isinstance(space, spaces.Box):
         return
     names = env.observation_names or tuple(f"element {i}" for i in range(seen.shape[1]))
-    findings = [*_of_limits(env, space, names, seen)]
+    contradicting = {one.name for one in misread if one.contradicts}
+    findings = [*_of_limits(env, space, names, seen, contradicting)]
     if not _is_normalized(env):
         findings += _of_sizes(names, seen)
     findings += _of_still(env, names, np.concatenate([seen, second.observations]))
@@ -446,9 +477,11 @@ def _is_normalized(env: FMUEnv) -> bool:
 
 
 def _of_limits(
-    env: FMUEnv, space: spaces.Box, names: tuple[str, ...], seen: Any
+    env: FMUEnv, space: spaces.Box, names: tuple[str, ...], seen: Any, misread: Set[str]
 ) -> Iterator[Finding]:
+    """Tell observations beyond their limits, but for those that are in another unit."""
     outside = ((seen < space.low.reshape(-1)) | (seen > space.high.reshape(-1))).any(axis=0)
+    outside &= [name not in misread for name in names]
     if outside.any():
         listing = ", ".join(_range(env, names[i], seen[:, i]) for i in np.flatnonzero(outside))
         yield Finding(
