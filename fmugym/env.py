@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import os
+import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, Final, Never
 import gymnasium
 import numpy as np
 from gymnasium import logger as gymnasium_logger
+from gymnasium.envs.registration import EnvSpec
 
 from fmugym.archive.texts import values_by_name
 from fmugym.checks import check_misplaced, check_option, check_seed
@@ -35,6 +37,7 @@ from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
+from fmugym.task.specs import EpisodeLimit, limit_of_make
 from fmugym.task.starting import start_time_of
 
 __all__ = [
@@ -313,6 +316,21 @@ class FMUEnv(Constructed):
         steps = (self.inside.warm_up_steps + self.step_count) * self.inside.spec.substeps
         return self.inside.spec.communication_point(steps, start_time_of(self))
 
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's spec, whose ``max_episode_steps`` is at most that of the config."""
+        return vars(self).get("spec")
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        limit = EpisodeLimit.of(self)
+        try:
+            limit.require(limit_of_make(sys._getframe(1)))
+            vars(self)["spec"] = limit.told_by(value)
+        except ConfigError:
+            self.close()  # nobody gets this environment
+            raise
+
     # Snapshots.
 
     @alone
@@ -372,6 +390,7 @@ class FMUEnv(Constructed):
         """Make a new environment in the middle of the same episode, if there is one."""
         args, kwargs = copy.deepcopy(self._constructor_arguments, memo)
         twin = type(self)(*args, **kwargs)
+        twin.spec = copy.deepcopy(self.spec, memo)
         if self.inside.was_reset and self.inside.is_open:
             twin.restore_state(self.save_state())
         return twin
@@ -464,9 +483,15 @@ class FMUEnv(Constructed):
                 self.inside.renderer = None
         super().close()
 
-    def __reduce__(self) -> tuple[Callable[[], FMUEnv], tuple[()]]:
+    def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
         args, kwargs = self._constructor_arguments
-        return partial(type(self), *args, **kwargs), ()
+        return _rebuilt, (partial(type(self), *args, **kwargs), self.spec)
+
+
+def _rebuilt(make: Callable[[], FMUEnv], spec: EnvSpec | None) -> FMUEnv:
+    env = make()
+    env.spec = spec
+    return env
 
 
 def inner_env(env: Any) -> FMUEnv:

@@ -1,5 +1,6 @@
 """Specs of registered environments: as text, pickled, and in another program."""
 
+import copy
 import json
 import pickle
 
@@ -206,3 +207,161 @@ def test_dicts_that_are_no_distributions(value, names):
 def test_what_cannot_be_registered(env_id, env, name):
     with pytest.raises(ConfigError, match=name):
         fmugym.register(env_id, env)
+
+
+LENGTH = 30
+TASK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": "20ms",
+    "episode_length": "600ms",
+    "variables": {"tau": {"min": -0.01, "max": 0.01}},
+    "agent": {"actions": ["tau"], "observations": ["q", "q_dot"]},
+    "scenarios": {"short": {"start": "1d", "length": "100ms"}},
+    "clock": "0s",
+    "reward": "-abs(q)",
+}
+
+
+class Config(fmugym.FMUEnv):
+    """A class with more keys in its config."""
+
+    def __init__(self, **changes):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "time_step": 0.02,
+            "bounds": {"tau": (-1, 1)},
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum"), config | changes)
+
+    def _is_done(self):
+        return False
+
+
+class TestEpisodeLength:
+    """The spec tells after how many steps an episode is truncated."""
+
+    def make(self, way, **options):
+        if way == "load":
+            return fmugym.load(TASK, **options)
+        return gymnasium.make("fmugym/FMU-v0", config=TASK, **options)
+
+    @pytest.fixture(params=["load", "make"])
+    def env(self, request, opened):
+        return opened(self.make(request.param))
+
+    def test_is_in_the_spec(self, env):
+        assert env.spec.max_episode_steps == LENGTH
+        assert env.unwrapped.spec.max_episode_steps == LENGTH
+
+    def test_is_known_to_wrappers(self, env):
+        wrapped = gymnasium.wrappers.TimeAwareObservation(env, normalize_time=True)
+        seen = [wrapped.reset(seed=0)[0][-1]]
+        truncated = False
+        while not truncated:
+            observation, _, _, truncated, _ = wrapped.step(env.action_space.sample())
+            seen.append(observation[-1])
+        np.testing.assert_allclose(seen, np.arange(LENGTH + 1) / LENGTH, rtol=1e-6)
+
+    def test_is_that_of_a_scenario(self, opened):
+        env = opened(fmugym.load(TASK, scenario="short"))
+        assert env.spec.max_episode_steps == 5
+
+    @pytest.mark.parametrize("way", ["load", "make"])
+    @round_trips
+    def test_the_spec_makes_the_same_again(self, way, through, opened):
+        env = opened(self.make(way, scenario="short"))
+        twin = opened(gymnasium.make(through(env.spec)))
+        assert twin.spec.max_episode_steps == 5
+        np.testing.assert_array_equal(env.reset(seed=4)[0], twin.reset(seed=4)[0])
+        assert twin.unwrapped.config == env.unwrapped.config
+
+    def test_a_copy_has_it(self, env, opened):
+        assert opened(copy.deepcopy(env.unwrapped)).spec.max_episode_steps == LENGTH
+        assert opened(pickle.loads(pickle.dumps(env.unwrapped))).spec.max_episode_steps == LENGTH
+
+    def test_of_bundled_environments(self, opened):
+        assert opened(gymnasium.make("fmugym/House-v0")).spec.max_episode_steps == 672
+        assert opened(gymnasium.make_vec("fmugym/House-v0", 2)).spec.max_episode_steps == 672
+        assert opened(gymnasium.make("fmugym/CartPole-v0")).spec.max_episode_steps == 500
+
+    @pytest.mark.parametrize(
+        ("limits", "expected"),
+        [
+            ({"max_episode_steps": 7}, 7),
+            ({"stop_time": 0.2}, 10),
+            ({"max_episode_steps": 7, "stop_time": 0.1}, 5),
+            ({}, None),
+        ],
+    )
+    def test_of_classes(self, limits, expected, opened):
+        fmugym.register("tests/Limited-v0", Config, kwargs=limits)
+        try:
+            env = opened(gymnasium.make("tests/Limited-v0"))
+            envs = opened(gymnasium.make_vec("tests/Limited-v0", 2))
+        finally:
+            del gymnasium.registry["tests/Limited-v0"]
+        assert env.spec.max_episode_steps == envs.spec.max_episode_steps == expected
+
+
+class TestShorterLimits:
+    """They win."""
+
+    def test_of_one(self, opened):
+        env = opened(gymnasium.make("fmugym/FMU-v0", config=TASK, max_episode_steps=4))
+        assert env.spec.max_episode_steps == 4
+        env.reset(seed=0)
+        ends = [env.step(env.action_space.sample())[3] for _ in range(4)]
+        assert ends == [False, False, False, True]
+
+    @pytest.mark.parametrize("given", [4, LENGTH, None])
+    def test_of_many(self, given, opened):
+        options = {} if given is None else {"max_episode_steps": given}
+        envs = opened(gymnasium.make_vec("fmugym/FMU-v0", 3, config=TASK, **options))
+        expected = given or LENGTH
+        assert envs.spec.max_episode_steps == expected
+        envs.reset(seed=0)
+        ends = [envs.step(envs.action_space.sample())[3].tolist() for _ in range(expected)]
+        assert ends == [[False] * 3] * (expected - 1) + [[True] * 3]
+
+    def test_copies_keep_them(self, opened):
+        envs = gymnasium.make_vec("fmugym/FMU-v0", 3, config=TASK, max_episode_steps=4)
+        twins = opened(pickle.loads(pickle.dumps(opened(envs))))
+        assert twins.spec.max_episode_steps == 4
+
+
+TOO_LONG = {
+    "make": lambda: gymnasium.make("fmugym/FMU-v0", config=TASK, max_episode_steps=31),
+    "make_vec": lambda: gymnasium.make_vec("fmugym/FMU-v0", 2, config=TASK, max_episode_steps=31),
+    "many": lambda: fmugym.FMUVectorEnv(lambda: fmugym.load(TASK), 2, max_episode_steps=31),
+    "sync": lambda: gymnasium.make_vec(
+        "fmugym/FMU-v0", 2, "sync", config=TASK, max_episode_steps=31
+    ),
+}
+
+
+class TestLongerLimits:
+    """They are refused: no episode would be as long."""
+
+    @pytest.mark.parametrize("make", TOO_LONG.values(), ids=TOO_LONG)
+    def test_name_the_length(self, make):
+        with pytest.raises(ConfigError, match="episode_length") as caught:
+            make()
+        for fact in ("31", "30", "0.6 s"):
+            assert fact in str(caught.value)
+
+    def test_of_a_bundled_task(self):
+        with pytest.raises(ConfigError, match=r"episode_length.*672"):
+            gymnasium.make("fmugym/House-v0", max_episode_steps=673)
+        with pytest.raises(ConfigError, match=r"episode_length.*672"):
+            gymnasium.make_vec("fmugym/House-v0", 2, max_episode_steps=673)
+
+    @pytest.mark.parametrize("make", [gymnasium.make, lambda name: gymnasium.make_vec(name, 2)])
+    def test_of_an_id(self, make):
+        options = {"config": TASK}
+        fmugym.register("tests/Long-v0", "fmugym:load", max_episode_steps=31, kwargs=options)
+        try:
+            with pytest.raises(ConfigError, match="episode_length"):
+                make("tests/Long-v0")
+        finally:
+            del gymnasium.registry["tests/Long-v0"]

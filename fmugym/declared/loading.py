@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+import gymnasium
 
 from fmugym.checks import check_flag
 from fmugym.declared.entries import Entry
@@ -40,6 +43,14 @@ def load(
             line and the key.
         FMULoadError: If the FMU cannot be used on this machine.
     """
+    given = {"config": config, "scenario": scenario, "physical": physical, **arguments}
+    env = _loaded(**given)
+    kwargs = {name: one for name, one in given.items() if one is not None and one is not False}
+    env.spec = replace(gymnasium.spec("fmugym/FMU-v0"), kwargs=kwargs)
+    return env
+
+
+def _loaded(config: Any, scenario: str | None, physical: bool, **arguments: Any) -> FMUEnv:
     if config is None:
         raise ArgumentError("give the argument 'config': the path of a task file, or a dict")
     task = Task.draft(config)

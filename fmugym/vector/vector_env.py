@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
@@ -20,6 +21,7 @@ from fmugym.task.alone import alone
 from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
+from fmugym.task.specs import EpisodeLimit
 from fmugym.vector.arguments import (
     HOOKS,
     autoreset_mode_of,
@@ -147,6 +149,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _set_up(self, hooks: str, max_episode_steps: int | None) -> None:
         inside, env, count = self.inside, self.inside.prototype, self.num_envs
+        inside.limit = EpisodeLimit.of(env).shortened(max_episode_steps)
         prepare_hooks(env)  # its constructor may have set some as attributes
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = env.render_mode
@@ -496,6 +499,15 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         require_open(self, "set_attr")
         self.inside.attributes.set(name, values)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's spec, whose ``max_episode_steps`` truncates episodes."""
+        return vars(self).get("spec")
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        vars(self)["spec"] = self.inside.limit.told_by(value)
 
     @property
     @alone

@@ -9,6 +9,7 @@ from typing import Any
 from fmugym.env import FMUEnv
 from fmugym.pool import Pool
 from fmugym.task.alone import Guard, make_guard
+from fmugym.task.specs import EpisodeLimit
 from fmugym.vector.attributes import Attributes
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
@@ -29,6 +30,7 @@ class VectorInside:
         engine: Has what hooks read, and calls them.
         episodes: Saves, restores and tries out episodes.
         attributes: Reads, sets and calls what single environments have.
+        limit: The largest number of steps of an episode.
         at_ends: What is called of the actions where episodes have ended; see ``look_at_ends``.
     """
 
@@ -37,6 +39,7 @@ class VectorInside:
     engine: Engine
     episodes: Episodes
     guard: Guard
+    limit: EpisodeLimit
     maker: EnvMaker
     pool: Pool
     prototype: FMUEnv
