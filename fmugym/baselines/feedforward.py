@@ -82,6 +82,11 @@ class Schedule(Controller):
         self._actions = np.array([times[time] for time in self._times])
         self._start = _seconds(start)
 
+    @property
+    def values(self) -> list[float]:
+        """The actions, in the order of their times."""
+        return [float(action) for action in self._actions]
+
     def _prepare(self) -> None:
         self._limits()
         self._steps = np.zeros(self.count)

@@ -13,6 +13,7 @@ import numpy as np
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY
 from fmugym.declared.entries import Entry
+from fmugym.declared.enumerations import check_levels
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
@@ -289,6 +290,7 @@ class Declarations:
                 actions.append(variable)
                 self.variables.check_input(entry, variable)
                 _check_action(variable)
+                check_levels(variable)
         entry = self.root.child("agent").child("actions")
         mistakes = self.root.mistakes
         hidden = any(mistakes.explain(("variables", one.alias, "levels")) for one in actions)

@@ -260,9 +260,9 @@ VARIABLE: Final = Table(
         ),
         "levels": Key(
             Kind(_levels, _NUMBERS),
-            "The values that an action chooses from. The agent's action space is then `Discrete` "
-            "or `MultiDiscrete`; [controllers](task-file.md#what-controllers-see-and-write) write "
-            "values.",
+            "The values that an action chooses from; of an Enumeration, values of its items. The "
+            "agent's action space is then `Discrete` or `MultiDiscrete`; "
+            "[controllers](task-file.md#what-controllers-see-and-write) write values.",
         ),
         "delta": Key(
             POSITIVE,

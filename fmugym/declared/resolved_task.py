@@ -24,6 +24,7 @@ from fmugym.declared.configuring import (
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
+from fmugym.declared.enumerations import check_written
 from fmugym.declared.expressions import Expression
 from fmugym.declared.kpis import Kpi, kpi_name
 from fmugym.declared.mathematics import minimum
@@ -150,6 +151,8 @@ class ResolvedTask:
         declared = self._declared
         for entry, expression, moment in self._plain_expressions():
             yield entry, partial(self._naming.value, entry, expression, moment)
+        for name in declared.inputs:
+            yield self._place_of_input(name), partial(self._input_value, name)
         for name, one in declared.derived.items():
             yield one.entry, partial(self._naming.value_of, name, Moment.JUDGED)
         for term in (*declared.rewards.values(), *declared.costs.values()):
@@ -168,8 +171,6 @@ class ResolvedTask:
         for memory in self._declared.memory.values():
             if memory.update is not None:
                 yield memory.entry, memory.update, Moment.AFTER
-        for name, (_, expression) in self._declared.inputs.items():
-            yield self._root.child("inputs").child(name), expression, Moment.BEFORE
         for name in self._declared.warm_up.signals():
             entry = self._declared.warm_up.entry.child("controller")
             yield entry, Expression.parse(name), Moment.SEEN
@@ -305,15 +306,29 @@ class ResolvedTask:
             value = variable.conversion.inverse(self._naming.input(variable))
             is_kept = acting is not None and variable.alias not in acting
             values.append(self._naming.read("inputs", len(values)) if is_kept else value)
-        for name, (variable, expression) in declared.inputs.items():
-            entry = self._root.child("inputs").child(name)
-            value = self._naming.value(entry, expression, Moment.BEFORE).number
-            values.append(variable.conversion.inverse(value))
+        for name, (variable, _) in declared.inputs.items():
+            values.append(variable.conversion.inverse(self._input_value(name)))
         if not values:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
             )
         return values
+
+    def _place_of_input(self, name: str) -> Entry:
+        """Where the task says what is written to an input: an expression, or data."""
+        entry = self._root.child("inputs").child(name)
+        given = (series.entry.child("input") for series in self._declared.series.values())
+        return (
+            entry if entry.value is not None else next((e for e in given if e.value == name), entry)
+        )
+
+    def _input_value(self, name: str) -> Value:
+        """The value of an input that an expression or data write, in the unit of the task."""
+        variable, expression = self._declared.inputs[name]
+        entry = self._place_of_input(name)
+        value = self._naming.value(entry, expression, Moment.BEFORE).number
+        check_written(entry, variable, value, self._declared.memory)
+        return value
 
     def _action_masks(self) -> Hook | None:
         naming, values = self._naming, list[Value]()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from fmugym.checks import check_text
 from fmugym.declared.entries import Entry
+from fmugym.declared.enumerations import check_controller
 from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.variables import TaskVariable
 from fmugym.errors import shown, unknown_name
@@ -72,6 +73,7 @@ def read_warm_up(
                 if one.value in THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
+            check_controller(one, variable, controllers[name])
     return WarmUpTable(
         entry, entry.value.get("period", 0.0), controllers, entry.value.get("cache", False)
     )

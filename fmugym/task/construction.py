@@ -236,6 +236,8 @@ def prepare_hooks(env: Constructed) -> None:
     interface, derived = inside.interface, not own.get_action_space
     values = fmu_spaces.discrete_values(interface.inputs) if derived else None
     inside.action_values = values
+    if own.get_action_space and not own.get_inputs:
+        fmu_spaces.check_choices(interface.inputs, env.action_space)
     default = not own.get_observation
     make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
     inside.observe = make(interface, space)

@@ -42,6 +42,7 @@ class OwnHooks:
     goal_reward: bool
     reward_policy: bool
     get_action_space: bool
+    get_inputs: bool
 
     @classmethod
     def of(cls, env: Any, base: type[Any]) -> OwnHooks:

@@ -26,6 +26,7 @@ from fmugym.task.interface import Interface
 
 __all__ = [
     "action_space",
+    "check_choices",
     "default_observation",
     "discrete_values",
     "observation_space",
@@ -54,6 +55,29 @@ def action_space(interface: Interface) -> spaces.Space[Any]:
                 "_get_action_space"
             )
     return _space(interface.inputs)
+
+
+def check_choices(variables: Sequence[Variable], space: spaces.Space[Any]) -> None:
+    """Check that each choice of a class's own action space is an item of its Enumeration.
+
+    Args:
+        variables: The inputs, which get the elements of the action as they are.
+        space: The action space.
+
+    Raises:
+        ConfigError: If one is none; the input would get the nearest item instead.
+    """
+    match space:
+        case spaces.Discrete():
+            first, counts = [int(space.start)], [int(space.n)]
+        case spaces.MultiDiscrete() | spaces.MultiBinary():
+            counts = np.ravel(getattr(space, "nvec", np.full(space.shape or (), 2))).tolist()
+            first = np.ravel(getattr(space, "start", np.zeros_like(counts))).tolist()
+        case _:  # a continuous value is rounded
+            return
+    for variable, low, count in zip(variables, first, counts, strict=False):
+        for value in range(low, low + count) if variable.items else ():
+            checked_value(variable, value)
 
 
 def observation_space(interface: Interface) -> spaces.Space[Any]:
