@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -18,8 +19,17 @@ from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.controller import Controller, FloatArray, attribute_of, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.baselines.tuning import numbers_at
+from fmugym.checks import (
+    LARGEST_COUNT,
+    check_flag,
+    check_integer,
+    check_mapping,
+    check_text,
+    require_regular,
+)
 from fmugym.errors import ConfigError, reading, shown
 from fmugym.search.flattening import choices_of, rows_of
+from fmugym.signals import Ignoring
 
 __all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
 
@@ -53,6 +63,48 @@ def scale_of(moments: FloatArray) -> FloatArray:
     deviation = np.sqrt(np.maximum(squares - mean**2, 0.0))
     is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
     return np.stack([mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)])
+
+
+def _text(what: str, value: Any) -> str | None:
+    if value is None:
+        return None
+    text = check_text(what, value)
+    if has_range(text):
+        search_of(text)
+    else:
+        controller_of(text)
+    return text
+
+
+def _numbers(what: str, value: Any) -> FloatArray:
+    with Ignoring(ValueError, OverflowError):  # lists of different lengths, numbers too large
+        array = np.array(value)
+        if not array.size or array.dtype.kind in "iuf":
+            return array.astype(np.float64)
+    raise ConfigError(f"{what} must be numbers, got {shown(value)}")
+
+
+def _names(what: str, value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list):
+        raise ConfigError(f"{what} must be a list of names, got {shown(value)}")
+    return tuple(check_text(f"each of the {what}", one) for one in value)
+
+
+_width: Final = partial(check_integer, minimum=0, maximum=LARGEST_COUNT)
+
+_CHECKS: Final[dict[str, Callable[[str, Any], Any]]] = {
+    "name": check_text,
+    "text": _text,
+    "observed": _width,
+    "acting": _width,
+    "hidden": _width,
+    "history": check_flag,
+    "weights": _numbers,
+    "scale": _numbers,
+    "names": _names,
+    "actions": check_text,
+}
+"""What the file of an agent has, and what may be there."""
 
 
 @dataclass(frozen=True)
@@ -125,15 +177,28 @@ class Agent:
         Raises:
             ConfigError: If the file is missing or damaged.
         """
-        with reading(f"the agent in {shown(str(folder))} cannot be read"):
-            facts = json.loads((folder / AGENT).read_text(encoding="utf-8"))
-            weights, scale = (np.array(facts[name], np.float64) for name in ("weights", "scale"))
-            agent = cls(**facts | {"weights": weights, "scale": scale})
-            shapes = (agent.size,), (2, agent.features or 1)
-            is_finite = np.isfinite(np.append(weights, scale)).all()
-            if not is_finite or (weights.shape, scale.shape) != shapes:
-                raise ValueError(f"expected finite numbers of the shapes {shapes}")
-            return agent
+        failure = f"the agent in {shown(str(folder))} cannot be read"
+        try:
+            with reading(failure):
+                require_regular(folder / AGENT)
+                text = (folder / AGENT).read_text(encoding="utf-8")
+                return cls._checked(check_mapping(AGENT, json.loads(text)))
+        except ConfigError as error:
+            raise ConfigError(f"{failure}: {str(error).removeprefix(f'{failure}: ')}") from error
+
+    @classmethod
+    def _checked(cls, facts: dict[str, Any]) -> Self:
+        checked = {name: check(name, facts[name]) for name, check in _CHECKS.items()}
+        agent = cls(**facts | checked)
+        shapes = (agent.size,), (2, agent.features or 1)
+        is_finite = np.isfinite(np.append(agent.weights, agent.scale)).all()
+        if not is_finite or (agent.weights.shape, agent.scale.shape) != shapes:
+            raise ConfigError(f"expected finite numbers of the shapes {shapes}")
+        if not (agent.scale[1] > 0).all():
+            raise ConfigError(
+                f"the divisors in scale must be positive, got {shown(agent.scale[1])}"
+            )
+        return agent
 
     @property
     def is_found(self) -> bool:
@@ -233,8 +298,19 @@ class Policy(Controller):
         if agent.names:
             require_task("the agent", (agent.names, agent.actions), (self.names, str(space)))
         if agent.acting:
+            self._require_size()
             self._layers = agent.layers(np.atleast_2d(agent.weights))
         self._memory = self.starts
+
+    def _require_size(self) -> None:
+        """Refuse a network that does not fit the task, as that of a damaged file."""
+        agent, seen = self.agent, len(self.names)
+        fits = agent.observed == seen if agent.history else agent.observed <= seen
+        if not fits or agent.acting != self.acting:
+            raise ConfigError(
+                f"the agent is for another task: its network has {agent.observed} observations and "
+                f"{agent.acting} outputs, the task has {seen} and {self.acting}"
+            )
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if self.baseline is not None:

@@ -1,6 +1,7 @@
 """The search for policies: its steps against known optima, and what policies and arenas do."""
 
 import itertools
+import json
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
@@ -954,6 +955,46 @@ class TestAgent:
             path.write_bytes(content[:place] + wrong + content[place + 1 :])
             with suppress(ConfigError):
                 Agent.load(tmp_path)
+
+    ODD = (
+        *(None, True, -1, 2.5, 1e400, 10**30, "x", "pid of=3", "nan", [], {}, [[]], ["1", "2"]),
+        *([1, 2], [[1], [2, 3]], {"a": 1}, [None], 2**31, "mpc", "pid of=q setpoint=0..1"),
+        *([[0.0], [0.0]], ["theta"], ["theta", 3], "a" * 100_000),
+    )
+
+    def test_files_with_other_values_are_refused_or_act(self, agent, env, tmp_path):
+        """Values of another type or size: each of them in the place of each fact."""
+        agent.save(tmp_path)
+        facts, refused = json.loads((tmp_path / AGENT).read_text()), 0
+        observation, _ = env.reset(seed=0)
+        for name, value in itertools.product(facts, self.ODD):
+            (tmp_path / AGENT).write_text(json.dumps({**facts, name: value}))
+            try:
+                Agent.load(tmp_path).policy().bind(env).act(observation)
+            except ConfigError as error:
+                refused += bool(str(error))
+        assert refused > len(self.ODD) * len(facts) / 2
+
+    @pytest.mark.parametrize(
+        ("change", "fact"),
+        [
+            ({"text": {"pid": 1}}, "text must be a text, got {'pid': 1}"),
+            ({"names": [1, 2]}, "each of the names must be a text, got 1"),
+            ({"observed": "2"}, "observed must be an integer"),
+            ({"scale": [[0.0, 0.0], [1.0, 0.0]]}, "divisors"),
+            ({"weights": ["1", "1", "1"]}, "weights must be numbers"),
+        ],
+        ids=str,
+    )
+    def test_facts_of_other_types(self, change, fact, tmp_path):
+        numbers = {"weights": np.ones(3), "scale": np.ones((2, 2))}
+        Agent("own", None, 2, 1, names=self.NAMES, **numbers).save(tmp_path)
+        path = tmp_path / AGENT
+        path.write_text(json.dumps(json.loads(path.read_text()) | change))
+        with pytest.raises(ConfigError) as caught:
+            Agent.load(tmp_path)
+        assert fact in str(caught.value)
+        assert str(tmp_path) in str(caught.value)
 
     @pytest.mark.parametrize(
         "change",
