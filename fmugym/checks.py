@@ -14,6 +14,7 @@ import os
 import re
 import stat
 from collections.abc import Iterable, Mapping
+from functools import cache
 from numbers import Real
 from pathlib import Path
 from typing import Any, Final, Self
@@ -290,13 +291,24 @@ def check_dict(what: str, value: Any) -> dict[Any, Any]:
 
 
 def require_regular(path: Path) -> None:
-    """Refuse pipes and devices, which may never end.
+    """Refuse pipes, devices and files of the kernel, which may never end.
 
     Raises:
-        OSError: If the path is none of a regular file.
+        OSError: If the path is none of a regular file. No path with a NUL character is.
     """
-    if not stat.S_ISREG(path.stat().st_mode):
+    if "\0" in str(path):
+        raise OSError(errno.EINVAL, "no file has a NUL character in its name")
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "it is no regular file")
+    if status.st_dev in _devices_of_kernel():
+        raise OSError(errno.EINVAL, "it is no regular file, but one of the kernel")
+
+
+@cache
+def _devices_of_kernel() -> frozenset[int]:
+    """The devices of the folders in which Linux makes files as they are read."""
+    return frozenset(one.stat().st_dev for one in map(Path, ("/proc", "/sys")) if one.is_mount())
 
 
 def check_path(what: str, value: Any) -> Path:

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from gymnasium.spaces.utils import flatdim, flatten, unflatten
 from gymnasium.utils.seeding import np_random
 
-from fmugym.checks import check_seed
+from fmugym.checks import check_seed, require_regular
 from fmugym.env import inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.signals import ordinary
@@ -131,6 +131,7 @@ class Recording:
             ConfigError: If the file is none, of another version of the format, or damaged.
         """
         try:
+            require_regular(Path(path))
             with np.load(path, allow_pickle=False) as file:
                 _require_small(file.zip)
                 header = json.loads(file["header"].tobytes())

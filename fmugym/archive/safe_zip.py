@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final, cast
 
-from fmugym.checks import KnownArguments
+from fmugym.checks import KnownArguments, require_regular
 from fmugym.errors import FMULoadError, nearest_name, reason
 from fmugym.keys import LARGE_COUNT, check_fields, key
 from fmugym.signals import ordinary
@@ -117,6 +117,7 @@ class SafeZip:
         try:
             if not path.is_file():
                 raise FMULoadError(f"there is no FMU at {path}{_what_is_there(path)}")
+            require_regular(path)
             self._version = _version_of(path)
             entries = _read_directory(path, limits)
         except ordinary(*_ZIP_ERRORS) as error:

@@ -18,7 +18,7 @@ from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from asyncua.crypto.uacrypto import CertProperties, load_certificate
 from cryptography import x509
 
-from fmugym.checks import check_path
+from fmugym.checks import check_path, require_regular
 from fmugym.errors import ConfigError, shown
 from fmugym.plant.polling import Answer, CertificateError, Values
 from fmugym.plant.secrets import credentials, require_secret
@@ -134,6 +134,7 @@ async def _only(
 
 def _content(path: Path) -> Any:
     """What a file has, read at once: the library leaves files open when a poller is stopped."""
+    require_regular(path)
     return CertProperties(path.read_bytes(), path.suffix.removeprefix("."))
 
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from fmugym.checks import check_path
+from fmugym.checks import check_path, require_regular
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 
@@ -24,6 +24,7 @@ def require_secret(path: Path) -> None:
         ConfigError: If they may, or there is none.
     """
     try:
+        require_regular(path)
         mode = path.stat().st_mode & 0o777
     except ordinary(OSError) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None

@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from fmugym.baselines import Controller
-from fmugym.checks import check_option, check_path
+from fmugym.checks import check_option, check_path, require_regular
 from fmugym.env import FMUEnv
 from fmugym.episodes.simulation import Player, Policy, policy_of_controller
 from fmugym.errors import ConfigError, reading, shown
@@ -192,6 +192,7 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     file = path if path.is_file() else path / _MODEL
     kind = algorithm_of(algorithm if path.is_file() else _facts_in(path)["algorithm"])
     with reading(f"the agent in {shown(str(path))} cannot be read"):
+        require_regular(file)
         return kind.load(file, device="cpu"), _normalization_in(file.parent)
 
 
@@ -212,9 +213,10 @@ def read_facts(folder: Path, name: str, what_is_wrong: str, *needed: str) -> dic
         ConfigError: If there is no such file, or it lacks one of them.
     """
     try:
+        require_regular(folder / name)
         facts = json.loads((folder / name).read_text(encoding="utf-8"))
         return {**{one: facts[one] for one in needed}, **facts}
-    except ordinary(OSError, ValueError, KeyError, TypeError):
+    except ordinary(OSError, ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(f"{shown(str(folder))} {what_is_wrong}") from None
 
 
@@ -222,6 +224,7 @@ def _normalization_in(folder: Path) -> Any:
     path = folder / _NORMALIZATION
     if not path.exists():
         return None
+    require_regular(path)
     with path.open("rb") as file:
         normalization = pickle.load(file)
     wrappers = import_module("stable_baselines3.common.vec_env")
