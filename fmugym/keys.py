@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -80,17 +80,25 @@ class Listed:
     Attributes:
         kind: That of the values.
         or_one: Whether a single value stands for a list of one.
+        most: How many there may be; None for any number.
     """
 
     kind: AnyKind
     or_one: bool = False
+    most: int | None = None
 
 
 @dataclass(frozen=True)
 class Entries:
-    """A table of values of one kind under names of the user's choice."""
+    """A table of values of one kind under names of the user's choice.
+
+    Attributes:
+        kind: That of the values.
+        most: How many there may be; None for any number.
+    """
 
     kind: AnyKind
+    most: int | None = None
 
 
 @dataclass(frozen=True)
@@ -201,6 +209,8 @@ class _Reading(NamedTuple):
             case Either():
                 return self.read(kind.table if _is_table(value) else kind.other, keys, value)
             case Listed() if isinstance(value, list | tuple):
+                if kind.most is not None and len(value) > kind.most:
+                    return self._too_many(keys, kind.most, value)
                 return [self.read(kind.kind, keys, one) for one in value]
             case Listed(or_one=True):
                 return [self.read(kind.kind, keys, value)]
@@ -208,6 +218,8 @@ class _Reading(NamedTuple):
                 return self._note(keys, f"{keys[-1]} must be a list, got {shown(value)}")
             case Entries():
                 items = self._items(keys, value)
+                if items and kind.most is not None and len(items) > kind.most:
+                    return self._too_many(keys, kind.most, items)
                 return items and {
                     name: self.read(kind.kind, (*keys, name), one) for name, one in items.items()
                 }
@@ -215,6 +227,9 @@ class _Reading(NamedTuple):
 
     def _note(self, keys: Keys, text: object, is_unknown: bool = False) -> None:
         self.mistakes.append(Mistake(keys, str(text), is_unknown))
+
+    def _too_many(self, keys: Keys, most: int, given: Sized) -> None:
+        self._note(keys, f"{keys[-1]} has at most {most} names, got {len(given)}")
 
     def _items(self, keys: Keys, value: Any) -> dict[str, Any] | None:
         what = keys[-1] if keys else "a task"

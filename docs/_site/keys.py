@@ -132,9 +132,11 @@ def schema_of(kind: AnyKind) -> dict[str, Any]:
             return dict(kind.schema)
         case Listed():
             listed = {"type": "array", "items": schema_of(kind.kind)}
+            listed |= {} if kind.most is None else {"maxItems": kind.most}
             return {"anyOf": [schema_of(kind.kind), listed]} if kind.or_one else listed
         case Entries():
-            return {"type": "object", "additionalProperties": schema_of(kind.kind)}
+            most = {} if kind.most is None else {"maxProperties": kind.most}
+            return {"type": "object", "additionalProperties": schema_of(kind.kind), **most}
         case Either():
             return {"anyOf": [schema_of(kind.other), schema_of(kind.table)]}
     table: dict[str, Any] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import keyword
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import replace
 from itertools import product
@@ -76,7 +77,7 @@ class Declarations:
         """Read all sections, and note their mistakes, and what does not fit the FMU."""
         self.root, self.is_physical = root, is_physical
         self.variables = TaskVariables(root, description)
-        self._declared = [one for name in NAMING[1:] for one in root.child(name).value or ()]
+        self._declared = {one: None for name in NAMING[1:] for one in root.child(name).value or ()}
         _check_names(root)
         self.memory = _read(root, "memory", read_memory)
         self.derived = _read(root, "expressions", read_derived)
@@ -107,6 +108,13 @@ class Declarations:
         """The names that are not those of variables, also those that have mistakes."""
         return [*self.memory, *self.derived, *self.series, *self.steps, *self._declared]
 
+    def is_own(self, name: str) -> bool:
+        """Whether it is one of ``own_names``, of which there may be thousands."""
+        return any(
+            name in known
+            for known in (self.memory, self.derived, self.series, self.steps, self._declared)
+        )
+
     @property
     def has_reward_terms(self) -> bool:
         """Whether infos report several rewards by name."""
@@ -128,7 +136,7 @@ class Declarations:
 
     def _find(self, entry: Entry, role: str) -> TaskVariable | None:
         """The variable of a name; None for a name that is not that of a variable."""
-        if entry.value in self.own_names:
+        if self.is_own(entry.value):
             return None
         return self.variables.find(entry, entry.value, role, self.own_names)
 
@@ -155,7 +163,9 @@ class Declarations:
 
     def is_output(self, name: str) -> bool:
         """Whether a name stands for a value that is read from the FMU after each step."""
-        if name in {*self.own_names, *self.parameters, *_RESERVED, *self.written}:
+        if self.is_own(name) or name in self.parameters or name in _RESERVED:
+            return False
+        if name in self.written:
             return False
         variable = self.variables.get(name)
         return variable is not None and variable not in self.actions
@@ -210,7 +220,7 @@ class Declarations:
 
         That is the larger one of its limits where no nominal value is given.
         """
-        variable = None if name in self.own_names else self.variables[name]
+        variable = None if self.is_own(name) else self.variables[name]
         if variable is not None and variable.nominal is not None:
             return variable.nominal
         size = max(map(abs, self.limits_of(name)))
@@ -256,9 +266,9 @@ class Declarations:
             if not names:
                 self.root.required("agent")
                 raise entry.lack(f"{key} must name at least one variable")
-            for text in texts:
-                if texts.count(text) > 1:
-                    raise entry.error(f"{text!r} is named twice")
+            twice = next((text for text, count in Counter(texts).items() if count > 1), None)
+            if twice is not None:
+                raise entry.error(f"{twice!r} is named twice")
         return names
 
     def _with_fitted(

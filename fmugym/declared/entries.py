@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -55,14 +56,27 @@ class Source(NamedTuple):
 
     def line(self, keys: Sequence[str], element: str = "") -> int:
         """The first line that leads furthest along the keys; 0 if none does."""
-        found, first = 0, 0
-        for number, path in _paths(self.text):
-            shared = min(len(path), len(keys))
-            if shared > found and list(path[:shared]) == list(keys[:shared]):
-                found, first = shared, number
+        wholes, parts = _lines(self.text)
+        own = tuple(keys)
+        beginnings = (wholes.get(own[:length], 0) for length in range(len(own), 0, -1))
+        first = parts.get(own) or next(filter(None, beginnings), 0)
         lines = enumerate(self.text.splitlines()[first - 1 :], first) if first and element else ()
         quoted = f'"{element}"', f"'{element}'"
         return next((number for number, line in lines if any(q in line for q in quoted)), first)
+
+
+_Lines = dict[tuple[str, ...], int]
+
+
+@lru_cache(maxsize=32)
+def _lines(text: str) -> tuple[_Lines, _Lines]:
+    """The first lines that set keys, and those that set keys or what is in their tables."""
+    wholes, parts = _Lines(), _Lines()
+    for number, path in _paths(text):
+        wholes.setdefault(path, number)
+        for length in range(1, len(path) + 1):
+            parts.setdefault(path[:length], number)
+    return wholes, parts
 
 
 def _paths(text: str) -> Iterator[tuple[int, tuple[str, ...]]]:

@@ -105,7 +105,7 @@ class Expression:
             ConfigError: If it is no expression. The text tells the column.
         """
         if isinstance(value, bool | int | float):
-            value = repr(value)
+            value = repr(value if isinstance(value, bool) else _finite(value))
         if not isinstance(value, str):
             raise ConfigError(f"expected an expression, got {shown(value)}")
         if len(value) > _LONGEST:
@@ -155,10 +155,10 @@ class Expression:
             ConfigError: If a name is unknown, or the expression has something that is not in the
                 grammar. The text tells the column.
         """
-        try:
-            return _Evaluation(self.text, names).evaluate(self.tree)
-        except RecursionError:
-            raise ConfigError("expressions read each other in too long a row") from None
+        value = _Evaluation(self.text, names).evaluate(self.tree)
+        if value.constant is not None and not math.isfinite(value.constant):
+            raise ConfigError(f"{shown(self.text)} is no finite number, but {value.constant}")
+        return value
 
     def constant(self) -> float:
         """The value of an expression without names.
@@ -167,9 +167,15 @@ class Expression:
             ConfigError: If it has names, or the value is not finite.
         """
         value = self.value(Names(Graph())).number.constant
-        if value is None or not math.isfinite(value):
-            raise ConfigError(f"{self.text!r} is no finite number, but {value}")
+        if value is None:
+            raise ConfigError(f"expected a number, got {shown(self.text)}")
         return float(value)
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(float_or_nan(value)):
+        raise ConfigError(f"expected an expression or a finite number, got {shown(value)}")
+    return value
 
 
 def _parsed(text: str) -> ast.expr:

@@ -55,6 +55,8 @@ VERSION: Final = 1
 _DATE: Final = re.compile(r"(?:\d{4}-)?(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2}))?")
 _ANY_YEAR: Final = 2001  # without a leap day
 _DAY: Final = 86400.0
+_MOST_LEVELS: Final = 10_000
+_MOST_NAMES: Final = 5000
 _NORMALIZATIONS: Final = ("limits", "nominal")
 
 
@@ -74,6 +76,11 @@ def _probability(what: str, value: Any) -> float:
 
 
 def _levels(what: str, value: Any) -> tuple[float, ...]:
+    if isinstance(value, list | tuple) and len(value) > _MOST_LEVELS:
+        raise ConfigError(
+            f"an action has at most {_MOST_LEVELS} levels, got {len(value)}; with 'min' and 'max' "
+            "it is continuous"
+        )
     values = tuple(_numbers(what, value).tolist())
     if len(set(values)) < max(2, len(values)) or not all(map(math.isfinite, values)):
         raise ConfigError(f"expected two or more different numbers, got {shown(value)}")
@@ -152,6 +159,13 @@ def _column(what: str, value: Any) -> Any:
     raise ConfigError(f"{what} must be a name or a number, got {shown(value)}")
 
 
+def _path(what: str, value: Any) -> str:
+    text = check_text(what, value)
+    if "\0" in text:
+        raise ConfigError(f"{what} must be a path, and no path has a NUL, got {shown(value)}")
+    return text
+
+
 _NUMERIC: Final = {"title": "number", "type": ["number", "string", "boolean"]}
 _TIME: Final = {"title": "time", "type": ["number", "string"]}
 _DISTRIBUTION: Final = {
@@ -178,8 +192,8 @@ TIME_OR_DRAWN: Final = Kind(
     partial(number_or_distribution, read=duration), {**_DRAWN, "title": "time, distribution"}
 )
 NUMBERS: Final = Kind(_numbers, _NUMBERS)
-NAMES: Final = Listed(TEXT, or_one=True)
-PATH: Final = Kind(check_text, {"title": "path", **TEXT.schema}, "path")
+NAMES: Final = Listed(TEXT, or_one=True, most=_MOST_NAMES)
+PATH: Final = Kind(_path, {"title": "path", **TEXT.schema}, "path")
 CONTROLLER: Final = Kind(
     lambda _, value: value, {"title": "text, number", "type": ["string", "number"]}
 )
@@ -789,9 +803,11 @@ TASK: Final = Table(
             "the FMU's time",
         ),
         "scenarios": Key(
-            Entries(SCENARIO), "[Scenarios](task-file.md#clock-and-scenarios) by name."
+            Entries(SCENARIO, _MOST_NAMES), "[Scenarios](task-file.md#clock-and-scenarios) by name."
         ),
-        "variables": Key(Entries(VARIABLE), "[Variables](task-file.md#variables) by name."),
+        "variables": Key(
+            Entries(VARIABLE, _MOST_NAMES), "[Variables](task-file.md#variables) by name."
+        ),
         "parameters": Key(
             Entries(ANYTHING),
             "Start values and parameters: numbers, [distributions](config.md#distributions), items "
@@ -803,25 +819,28 @@ TASK: Final = Table(
             "draws a row. Its parameters take the place of those in `parameters`.",
         ),
         "data": Key(
-            Entries(DATA),
+            Entries(DATA, _MOST_NAMES),
             "[Columns](task-file.md#data-and-set-points) of CSV and Parquet files, of "
             "[weather](task-file.md#weather), of Modelica's tables, or lists of values, by name.",
         ),
-        "setpoints": Key(Entries(SETPOINT), "[Set points](task-file.md#set-points) by name."),
+        "setpoints": Key(
+            Entries(SETPOINT, _MOST_NAMES), "[Set points](task-file.md#set-points) by name."
+        ),
         "controllers": Key(
-            Entries(CONTROLLER),
+            Entries(CONTROLLER, _MOST_NAMES),
             "[Controllers](task-file.md#controllers) by name: what agents are compared with, for "
             "the warm-up, and for `--controller` on the command line.",
         ),
         "inputs": Key(
-            Entries(EXPRESSION),
+            Entries(EXPRESSION, _MOST_NAMES),
             "Expressions that write other inputs of the FMU before each step, by input.",
         ),
         "memory": Key(
-            Entries(MEMORY), "Values that the [task remembers](task-file.md#memory), by name."
+            Entries(MEMORY, _MOST_NAMES),
+            "Values that the [task remembers](task-file.md#memory), by name.",
         ),
         "expressions": Key(
-            Entries(NAMED),
+            Entries(NAMED, _MOST_NAMES),
             '[Expressions](task-file.md#expressions) by name: `error = "T - T_set"`, or '
             '`{ expr = "...", min = ..., max = ... }`.',
         ),
@@ -830,13 +849,14 @@ TASK: Final = Table(
             "What the [agent](task-file.md#agent) does and sees. Required unless there is a class.",
         ),
         "reward": Key(
-            Either(Entries(REWARD), EXPRESSION),
+            Either(Entries(REWARD, _MOST_NAMES), EXPRESSION),
             "An expression, or named ones that are [added up](task-file.md#rewards-and-costs). "
             "Required unless a class has a reward of its own.",
         ),
-        "costs": Key(Entries(COST), 'Expressions for `info["cost"]`, by name.'),
+        "costs": Key(Entries(COST, _MOST_NAMES), 'Expressions for `info["cost"]`, by name.'),
         "kpis": Key(
-            Entries(KPI), "[Figures of an episode](task-file.md#figures-of-an-episode) by name."
+            Entries(KPI, _MOST_NAMES),
+            "[Figures of an episode](task-file.md#figures-of-an-episode) by name.",
         ),
         "terminated": Key(EXPRESSION, "A condition: the task has ended.", None, "never"),
         "truncated": Key(

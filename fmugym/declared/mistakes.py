@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from fmugym.errors import TaskError
 
 __all__ = ["ConsequenceError", "Mistakes"]
 
 Keys = tuple[str, ...]
+
+_MOST: Final = 100
+"""Mistakes that one error tells, at most."""
 
 
 class ConsequenceError(TaskError):
@@ -38,7 +43,10 @@ class Mistakes:
             place: The number of its file, and the line; mistakes are told in this order.
             is_unknown: Whether there is no key of this name.
         """
-        self._found.setdefault(text, (keys, place))
+        if len(self._found) < _MOST:
+            self._found.setdefault(text, (keys, place))
+        if len(self._found) == _MOST:  # to look for more of them may take minutes
+            self.require_none()
         if is_unknown:
             self._unknown.add(keys)
 
@@ -69,5 +77,7 @@ class Mistakes:
             TaskError: If there are any.
         """
         told = sorted(self._found, key=lambda text: self._found[text][1])
+        if len(told) == _MOST:
+            told.append(f"these are the first {_MOST} mistakes; there may be more")
         if told or self._consequences:
             raise TaskError("\n".join(told or self._consequences.values()))

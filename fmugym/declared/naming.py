@@ -90,8 +90,8 @@ class Naming:
     def __init__(self, declared: Declarations, time_step: float, warm_steps: int = 0) -> None:
         self.declared, self.time_step, self.warm_steps = declared, time_step, warm_steps
         self.first_step = 1 - warm_steps
-        self._open: list[str] = []
         self._ahead = 0.0
+        self._values: dict[tuple[str, Moment, float], Value] = {}
         self._derived: dict[tuple[str, Moment, float], Value | None] = {}
         self.graph = Graph()
         self.lookups: dict[str, Lookup] = {}
@@ -181,8 +181,14 @@ class Naming:
         Raises:
             ConfigError: If it has unknown names, or names that have no value at this moment.
         """
-        with entry.placing():
-            return expression.value(self._names(moment, others))
+        key = expression.text, moment, self._ahead
+        if others or key not in self._values:
+            with entry.placing():
+                value = expression.value(self._names(moment, others))
+            if others:
+                return value
+            self._values[key] = value
+        return self._values[key]
 
     def _names(self, moment: Moment, others: Mapping[str, Value]) -> Names:
         def find(name: str) -> Value | None:
@@ -221,7 +227,7 @@ class Naming:
             return self._value_of_steps(name, moment)
         if name in declared.derived:
             return self._value_of_derived(name, moment)
-        if name in declared.own_names:
+        if declared.is_own(name):
             raise ConsequenceError(f"{name!r} has a mistake where it is declared")
         variable = declared.variables.get(name)
         return None if variable is None else self._value_of_variable(name, variable, moment)
@@ -314,19 +320,39 @@ class Naming:
         return self.value(entry, flags["terminated"], Moment.AFTER)
 
     def _value_of_derived(self, name: str, moment: Moment) -> Value:
-        derived, key = self.declared.derived[name], (name, moment, self._ahead)
-        if name in self._open:
-            raise derived.entry.error(f"{name!r} depends on itself")
-        if key not in self._derived:  # many may read it
-            self._derived[key] = None
-            self._open.append(name)
-            with derived.entry.noting():
-                self._derived[key] = self.value(derived.entry, derived.expression, moment)
-            self._open.pop()
+        declared, key = self.declared.derived, (name, moment, self._ahead)
+        for one in () if key in self._derived else self._needed_for(name, moment):
+            entry, expression = declared[one].entry, declared[one].expression
+            with entry.noting():
+                self._derived[one, moment, self._ahead] = self.value(entry, expression, moment)
         value = self._derived[key]
         if value is None:
             raise ConsequenceError(f"{name!r} has a mistake where it is declared")
         return value
+
+    def _needed_for(self, name: str, moment: Moment) -> list[str]:
+        """A named expression, after those that it reads; without those that count as known.
+
+        From now on they all count so. Thousands may read each other in a row.
+        """
+        declared, order, path = self.declared.derived, list[str](), set[str]()
+        waiting = [(name, False)]
+        while waiting:
+            one, is_done = waiting.pop()
+            key = one, moment, self._ahead
+            if is_done:
+                order.append(one)
+                path.discard(one)
+            elif one in path:
+                with declared[one].entry.noting():
+                    raise ConfigError(f"{one!r} depends on itself")
+            elif key not in self._derived:
+                self._derived[key] = None
+                path.add(one)
+                waiting.append((one, True))
+                names = sorted(declared[one].expression.names & declared.keys(), reverse=True)
+                waiting += ((other, False) for other in names)
+        return order
 
     def _value_of_variable(self, name: str, variable: TaskVariable, moment: Moment) -> Value:
         declared = self.declared

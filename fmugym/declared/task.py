@@ -35,6 +35,19 @@ _MOST_FILES: Final = 20
 """Files may extend each other in a chain of this length."""
 
 
+_LARGEST: Final = 16 * 2**20
+
+_DEEPEST: Final = 50
+_TOO_DEEP: Final = f"tables and lists stand in each other {_DEEPEST} times at most"
+
+_KEY: Final = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_TOO_LONG: Final = {
+    rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{_DEEPEST}}}": _TOO_DEEP,
+    r"(?<![\w.])[+-]?(?:\d_?+){1000}": "a number has 1000 digits at most",
+}
+"""What no task file needs, as patterns, and what to say of it."""
+
+
 @dataclass(frozen=True, repr=False)
 class Task:
     """A declared task.
@@ -98,7 +111,7 @@ class Task:
         sources = [_read(check_path("the path of a task", path).absolute())]
         while "extends" in sources[-1].document:
             entry = _root(sources[-1]).child("extends")
-            base = entry.path().resolve()
+            base = Path(os.path.realpath(entry.path()))  # which goes around in a circle of links
             if base in [source.path for source in sources] or len(sources) == _MOST_FILES:
                 raise entry.error(f"{shown(str(base))} is extended in a circle")
             with entry.placing():
@@ -125,6 +138,7 @@ class Task:
         cls, document: Mapping[str, Any], folder: str | os.PathLike[str] | None = None
     ) -> Task:
         start = Path.cwd() if folder is None else check_path("folder", folder).absolute()
+        _require_shallow(document)
         plain: dict[str, Any] = _grouped(_plain(check_mapping("config", document)))
         source = Source(None, start, "", _with_paths(plain, start))
         _check(source)
@@ -251,6 +265,11 @@ def _root(source: Source) -> Entry:
 def _read(path: Path) -> Source:
     try:
         require_regular(path)
+        if path.stat().st_size > _LARGEST:
+            raise ConfigError(
+                f"{shown(str(path))} has more than {_LARGEST} bytes, the most of a task file: "
+                "leave data in files of their own"
+            )
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise ConfigError(f"{shown(str(path))} is no TOML file: {_advice(path)}") from None
@@ -258,15 +277,44 @@ def _read(path: Path) -> Source:
         raise missing_file("task file", path, "*.toml") from None
     except ordinary(OSError) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
-    try:
-        document = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        lacks_quotes = re.search("Invalid value|Expected newline", str(error))
-        hint = "; texts and expressions stand in quotes" if lacks_quotes else ""
-        raise ConfigError(f"{path.name} is no TOML file: {reason(error)}{hint}") from None
+    document = _parsed(path, text)
     source = Source(path, path.parent, text, _with_paths(_grouped(_plain(document)), path.parent))
     _check(source)
     return source
+
+
+def _parsed(path: Path, text: str) -> dict[str, Any]:
+    """Parse TOML; the parser takes more than linear time for long keys and numbers."""
+    for pattern, what in _TOO_LONG.items():
+        match = re.search(pattern, text, re.MULTILINE)
+        if match:
+            line = 1 + text.count("\n", 0, match.end())
+            raise ConfigError(f"{path.name}, line {line}: {what}")
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        lacks_quotes = re.search("Invalid value|Expected newline", str(error))
+        hint = "; texts and expressions stand in quotes" if lacks_quotes else ""
+        raise ConfigError(f"{path.name} is no TOML file: {reason(error)}{hint}") from None
+    except (ValueError, RecursionError):
+        raise ConfigError(f"{path.name}: {_TOO_DEEP}") from None
+    _require_shallow(document, f"{path.name}: ")
+    return document
+
+
+def _require_shallow(document: Any, place: str = "") -> None:
+    """Refuse tables and lists in each other, too many for functions which call themselves.
+
+    A dict of the caller may hold itself.
+    """
+    level = [document]
+    for _ in range(_DEEPEST):
+        inner = (one.values() if isinstance(one, Mapping) else one for one in level)
+        parts = (part for parts in inner for part in parts)
+        level = list({id(p): p for p in parts if isinstance(p, Mapping | list | tuple)}.values())
+        if not level:
+            return
+    raise ConfigError(f"{place}{_TOO_DEEP}")
 
 
 def _advice(path: Path) -> str:
@@ -333,9 +381,13 @@ def _named(value: type) -> Any:
 
 def _with_paths(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Make the paths in a document absolute."""
-    return dict(
-        with_paths(TASK, document, lambda path: os.path.normpath(folder / Path(path).expanduser()))
-    )
+
+    def path_of(path: str) -> str:
+        if "\0" in path:  # which the check of the key refuses
+            return path
+        return os.path.normpath(folder / Path(path).expanduser())
+
+    return dict(with_paths(TASK, document, path_of))
 
 
 def _relative_path(path: str, folder: Path) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from fmugym.checks import check_text
+from fmugym.checks import check_text, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_controller
 from fmugym.declared.mistakes import ConsequenceError
@@ -162,7 +162,8 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
     if isinstance(value, str) and value in known:
         return _controller(known[value], {})
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return Constant(float(value))
+        with entry.placing():
+            return Constant(number_of("controller", value))
     with entry.placing():
         text = check_text("controller", value)
         if known and len(text.split()) == 1:

@@ -1,5 +1,7 @@
 """Enumerations: what a task, a class or an option writes is one of the items."""
 
+import re
+
 import fmu_tools
 import numpy as np
 import pytest
@@ -163,5 +165,5 @@ def test_a_class_whose_choices_are_items_is_taken(make_env):
 
 def test_options_are_checked(make_env):
     env = make_env(model_output_names="mode_out")
-    with pytest.raises(ConfigError, match="expected one of 1 .slow., 2 .fast., 5 .turbo., got 3"):
+    with pytest.raises(ConfigError, match=f"{re.escape(ITEMS)}, got 3"):
         env.reset(options={"model_parameters": {"mode": 3}})
