@@ -48,7 +48,9 @@ def check_controller(entry: Entry, variable: TaskVariable, controller: Controlle
         case Constant():
             _require_items(entry, variable.in_fmu, [controller.action])
         case Hysteresis():
-            _require_items(entry, variable.in_fmu, [controller.below, controller.above])
+            _require_items(
+                entry, variable.in_fmu, [float(controller.below), float(controller.above)]
+            )
         case Schedule():
             _require_items(entry, variable.in_fmu, controller.values)
 
@@ -92,7 +94,7 @@ def _known(value: Value, memory: Mapping[str, Memory]) -> Iterator[float]:
             case "interpolate", table:
                 rows = graph.tables[table]
                 yield from rows[len(rows) // 2 - 1 : -2].tolist()
-            case "row", ("variables", name) if name in memory:
+            case "row", ("variables", str(name)) if name in memory:
                 start = memory[name].start
                 starts = start.values if isinstance(start, Choice) else (start,)
                 yield from (one for one in starts if isinstance(one, int | float))

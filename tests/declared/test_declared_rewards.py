@@ -81,7 +81,6 @@ def in_a_row(text, count):
 REWARD = 'reward = "shift"'
 KPIS = "\n".join(["", "[kpis]", *(f'k{i} = {{ last = "shift * {i}" }}' for i in range(50))])
 LARGE = {
-    "long row": in_a_row("E + 1", 900),
     "many terms": (
         'shift = "theta - theta_0"\n[agent]',
         'shift = "sin(time) + cos(time) + exp(-time) + abs(time) + sqrt(time) + log(time + 1)"\n'
