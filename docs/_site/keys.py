@@ -108,12 +108,15 @@ def _label_of(schema: dict[str, Any]) -> str:
         return ", ".join(f"`{json.dumps(one)}`" for one in schema["enum"])
     names = {"string": "text", "boolean": "`true`, `false`"}
     least, most = schema.get("minimum"), schema.get("maximum")
+    kind = schema.get("type", "")
+    if isinstance(kind, list):  # or an expression of constants
+        kind = kind[0]
     if "exclusiveMinimum" in schema or (least == 1 and most is None):
-        return f"positive {schema['type']}"
+        return f"positive {kind}"
     limits = (
         "" if least is None else f" from {least} on" if most is None else f" from {least} to {most}"
     )
-    return names.get(schema.get("type", ""), schema.get("type", "anything")) + limits
+    return names.get(kind, kind or "anything") + limits
 
 
 def schema() -> dict[str, Any]:

@@ -6,9 +6,10 @@ import datetime
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -26,8 +27,8 @@ from fmugym.declared.expressions import Expression
 from fmugym.declared.quantities import finite, number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown
+from fmugym.keys import COUNT as INTEGER
 from fmugym.keys import (
-    COUNT,
     FLAG,
     REQUIRED,
     TEXT,
@@ -53,6 +54,7 @@ VERSION: Final = 1
 """The version of the format; it is raised when a key changes its meaning."""
 
 _DATE: Final = re.compile(r"(?:\d{4}-)?(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2}))?")
+_LIKE_A_DATE: Final = re.compile(r"\d+-\d+")
 _ANY_YEAR: Final = 2001  # without a leap day
 _DAY: Final = 86400.0
 _MOST_LEVELS: Final = 10_000
@@ -115,14 +117,29 @@ def _numbers(what: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.array([number(what, one) for one in value], np.float64)
 
 
+def _time(what: str, value: Any) -> float:
+    """Seconds: a duration, or an expression of constants."""
+    try:
+        return duration(what, value)
+    except ConfigError as error:
+        refusal = error
+    try:
+        expression = Expression.parse(value)
+    except ConfigError:
+        raise refusal from None
+    if not isinstance(value, str) or expression.names:
+        raise refusal
+    return check_number(what, expression.constant(), minimum=0)
+
+
 def _moment(what: str, value: Any) -> float:
     """Seconds since the beginning of a year of 365 days, of a duration or of a date."""
     given = value
     if isinstance(value, datetime.date):  # TOML has dates of its own
         value = value.isoformat()[:16]
-    if not isinstance(value, str) or "-" not in value:
-        return duration(what, value)
-    match = _DATE.fullmatch(value)
+    match = _DATE.fullmatch(value) if isinstance(value, str) else None
+    if match is None and not _LIKE_A_DATE.match(str(value)):
+        return _time(what, value)
     month, day, hour, minute = map(int, match.groups(default="0")) if match else (0, 0, 0, 0)
     try:
         date = datetime.datetime(_ANY_YEAR, month, day, hour, minute)
@@ -181,15 +198,15 @@ ANYTHING: Final = Kind(lambda _, value: value, {"title": "anything"})
 NUMBER: Final = Kind(number, _NUMERIC)
 FINITE: Final = Kind(finite, _NUMERIC)
 POSITIVE: Final = Kind(_within(number, positive=True), {**_NUMERIC, "title": "positive number"})
-TIME: Final = Kind(duration, _TIME)
-POSITIVE_TIME: Final = Kind(_within(duration, positive=True), {**_TIME, "title": "positive time"})
+TIME: Final = Kind(_time, _TIME)
+POSITIVE_TIME: Final = Kind(_within(_time, positive=True), {**_TIME, "title": "positive time"})
 DEVIATION: Final = Kind(_within(number, minimum=0), {**_NUMERIC, "title": "number from 0 on"})
 EXPRESSION: Final = Kind(
     lambda _, value: Expression.parse(value), {**_NUMERIC, "title": "expression"}
 )
 DRAWN: Final = Kind(number_or_distribution, _DRAWN)
 TIME_OR_DRAWN: Final = Kind(
-    partial(number_or_distribution, read=duration), {**_DRAWN, "title": "time, distribution"}
+    partial(number_or_distribution, read=_time), {**_DRAWN, "title": "time, distribution"}
 )
 NUMBERS: Final = Kind(_numbers, _NUMBERS)
 NAMES: Final = Listed(TEXT, or_one=True, most=_MOST_NAMES)
@@ -204,6 +221,34 @@ _LIMITS: Final = {
     "max": Key(NUMBER, "Upper limit for the observation space.", None, "no limit"),
 }
 _DESCRIPTION: Final = {"description": Key(TEXT, "A description for readers.")}
+
+
+def _evaluated(check: Callable[[str, Any], Any], what: str, value: Any) -> Any:
+    if isinstance(value, str):
+        number = Expression.parse(value).constant()
+        value = int(number) if number.is_integer() else number
+    return check(what, value)
+
+
+def _taking_expressions(kind: Any) -> Any:
+    """The same kind, or a table of such, where expressions of constants stand for numbers, too."""
+    match kind:
+        case Kind() if kind.schema.get("type") in ("number", "integer"):
+            schema = {**kind.schema, "type": [kind.schema["type"], "string"]}
+            return replace(kind, check=partial(_evaluated, kind.check), schema=schema)
+        case Listed() | Entries():
+            return replace(kind, kind=_taking_expressions(kind.kind))
+        case Either():
+            parts = map(_taking_expressions, (kind.table, kind.other))
+            return Either(*parts)
+        case Table():
+            keys = kind.keys.items()
+            taking = {n: one._replace(kind=_taking_expressions(one.kind)) for n, one in keys}
+            return replace(kind, keys=taking)
+    return kind
+
+
+COUNT: Final = _taking_expressions(INTEGER)
 
 
 # Variables.
@@ -581,10 +626,11 @@ KPI: Final = Table(
 
 def _of_width(lowest: int, highest: int) -> Kind:
     """An integer of a protocol."""
-    return Kind(
+    kind = Kind(
         lambda what, value: check_integer(what, value, lowest, highest),
         {"type": "integer", "minimum": lowest, "maximum": highest},
     )
+    return cast("Kind", _taking_expressions(kind))
 
 
 _UNIT_ID: Final = _of_width(0, 255)
@@ -707,7 +753,7 @@ _FMU: Final = Either(BUNDLED, PATH)
 
 COMPONENT: Final = Table(
     {
-        **table_of(Component).keys,
+        **_taking_expressions(table_of(Component)).keys,
         "fmu": Key(_FMU, "Path of the FMU; it alone is short for this."),
         "bundled": Key(TEXT, 'Or the name of an FMU of fmugym, such as `"House"`.'),
         **_VERSION_OF_FMI,
@@ -716,9 +762,11 @@ COMPONENT: Final = Table(
     one_of=("fmu", "bundled"),
 )
 
+_SYSTEM: Final = _taking_expressions(SYSTEM)
+
 SYSTEM_OF_TASK: Final = Table(
     {
-        **{n: one for n, one in SYSTEM.keys.items() if n not in {"start_time", "stop_time"}},
+        **{n: one for n, one in _SYSTEM.keys.items() if n not in {"start_time", "stop_time"}},
         "components": Key(
             Entries(COMPONENT),
             'By name: the path of an FMU, `{ bundled = "House" }`, or a '
@@ -746,10 +794,12 @@ _OF_SECTIONS: Final = {
 }
 """Keys of a config that other sections of a task determine, and how."""
 
-CONFIG_OF_TASK: Final = Table(
-    {n: one._replace(default=None) for n, one in CONFIG.keys.items() if n not in _OF_SECTIONS},
-    what="key of [config]",
-    elsewhere={name: f": {text}" for name, text in _OF_SECTIONS.items()},
+CONFIG_OF_TASK: Final = _taking_expressions(
+    Table(
+        {n: one._replace(default=None) for n, one in CONFIG.keys.items() if n not in _OF_SECTIONS},
+        what="key of [config]",
+        elsewhere={name: f": {text}" for name, text in _OF_SECTIONS.items()},
+    )
 )
 
 TASK: Final = Table(
@@ -870,7 +920,8 @@ TASK: Final = Table(
             "[Where a plant has the variables](plant.md), for `simulate --plant` and `serve`.",
         ),
         "foreign": Key(
-            Table(FOREIGN.keys), "[Keys for experts](foreign.md), about FMUs of unknown quality."
+            _taking_expressions(Table(FOREIGN.keys)),
+            "[Keys for experts](foreign.md), about FMUs of unknown quality.",
         ),
         "config": Key(
             CONFIG_OF_TASK, "More keys of the [config](config.md#config-keys), such as `on_fault`."

@@ -70,13 +70,20 @@ def finite(what: str, value: Any) -> float:
     return check_number(what, number(what, value), may_be_boolean=True)
 
 
-def number_or_distribution(what: str, value: Any, read: Callable[[str, Any], Any] = finite) -> Any:
+def number_or_distribution(
+    what: str,
+    value: Any,
+    read: Callable[[str, Any], Any] = finite,
+    *,
+    draws_texts: bool = False,
+) -> Any:
     """A number, or a distribution, whose numbers may be texts with expressions of constants.
 
     Args:
         what: Its name, for the error.
         value: As the user gave it.
         read: Reads what is no distribution.
+        draws_texts: Whether texts among the values of a choice stand for themselves.
 
     Raises:
         ConfigError: If it is neither.
@@ -86,6 +93,9 @@ def number_or_distribution(what: str, value: Any, read: Callable[[str, Any], Any
     if not isinstance(value, Mapping):
         return read(what, value)
     items = check_mapping(what, value)
-    for name in items.keys() - {"distribution", "values", "probabilities"}:
-        items[name] = number(name, items[name])
+    for name, given in items.items():
+        if isinstance(given, list | tuple) and not (draws_texts and name == "values"):
+            items[name] = [number(name, one) if isinstance(one, str) else one for one in given]
+        elif name not in {"distribution", "values", "probabilities"}:
+            items[name] = number(name, given)
     return as_distribution(what, items)

@@ -355,7 +355,7 @@ def start_value(variable: TaskVariable, entry: Entry) -> Any:
     value, is_text = entry.value, bool(in_fmu.items) or in_fmu.kind == "string"
     with entry.placing():
         if not (isinstance(value, str) and is_text):
-            value = number_or_distribution(entry.name, value)
+            value = number_or_distribution(entry.name, value, draws_texts=is_text)
         value = _in_unit_of_fmu(variable.conversion, value)
         if in_fmu.kind == "string":
             return value
