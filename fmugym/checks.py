@@ -13,7 +13,8 @@ import operator
 import os
 import re
 import stat
-from collections.abc import Iterable, Mapping
+import unicodedata
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from numbers import Real
 from pathlib import Path
@@ -27,6 +28,7 @@ from fmugym.signals import Ignoring, ordinary
 __all__ = [
     "LARGEST_COUNT",
     "KnownArguments",
+    "Spellings",
     "check_count",
     "check_dict",
     "check_flag",
@@ -43,6 +45,7 @@ __all__ = [
     "float_or_nan",
     "has_method",
     "integer_of",
+    "normal_form",
     "number_of",
     "parts_of_array",
     "require_regular",
@@ -321,6 +324,50 @@ def check_path(what: str, value: Any) -> Path:
         return Path(os.fsdecode(value)).expanduser()
     except ordinary(Exception):  # nobody has this home, or the object's method fails
         raise ConfigError(f"{what} must be a path, got {shown(value)}") from None
+
+
+class Spellings:
+    """Names, of which each is also found by letters that only look other.
+
+    ``µ`` is the micro sign or a Greek letter, ``ü`` is one letter or two, and there are ligatures.
+    Names count as equal if their normal forms NFKC are, as in Python. An exact name wins.
+
+    Args:
+        kind: What the names name, for the error.
+        names: The names.
+    """
+
+    def __init__(self, kind: str, names: Collection[str]) -> None:
+        self._kind, self._names = kind, names
+        self._others: dict[str, list[str]] = {}
+        for name in names:
+            if not name.isascii():
+                self._others.setdefault(normal_form(name), []).append(name)
+
+    def find(self, name: Any) -> str | None:
+        """The name that is meant; None if there is none.
+
+        Raises:
+            ConfigError: If it may be several. The text tells their letters by numbers.
+        """
+        if not isinstance(name, str) or name in self._names:
+            return name if isinstance(name, str) else None
+        normal = normal_form(name)
+        found = [*self._others.get(normal, ())]
+        if normal in self._names and normal not in found:
+            found.append(normal)
+        if len(found) > 1:
+            told = ", ".join(map(ascii, found))
+            raise ConfigError(
+                f"{self._kind} {name!a} may be any of {told}, which only look the same; write "
+                "one of them exactly"
+            )
+        return found[0] if found else None
+
+
+def normal_form(name: str) -> str:
+    """A name in the form in which names are compared: NFKC."""
+    return name if name.isascii() else unicodedata.normalize("NFKC", name)
 
 
 def flattened(value: Any, around: tuple[Any, ...] = ()) -> tuple[tuple[int, ...] | None, list[Any]]:

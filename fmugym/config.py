@@ -16,6 +16,7 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import (
     KnownArguments,
+    Spellings,
     check_integer,
     check_mapping,
     check_number,
@@ -381,7 +382,9 @@ class EnvConfig:
         if not self.model_output_names:
             raise ConfigError("config key 'model_output_names' names no output")
         for name in self.samplings:
-            if name not in read and "[" not in name:  # an element of an array may be meant
+            if (
+                Spellings("output", read).find(name) is None and "[" not in name
+            ):  # an element of an array may be meant
                 raise unknown_name("output in 'samplings'", name, read)
         for name in self.episode_variables:
             if name in self.model_parameters:

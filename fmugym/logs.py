@@ -26,7 +26,7 @@ from gymnasium import spaces
 
 from fmugym.archive.units import Conversion, conversion_of
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number, require_regular
+from fmugym.checks import Spellings, check_number, require_regular
 from fmugym.declared import Task
 from fmugym.declared.entries import Entry
 from fmugym.declared.series import is_number, read_csv, read_data
@@ -344,7 +344,8 @@ def _as_logged(entry: Entry, log: PlantLog, name: str) -> dict[str, Any]:
 
 def declared_as(env: FMUEnv, alias: str) -> tuple[str, str | None]:
     """The name in the FMU of a variable of a task, and the unit that the task declares for it."""
-    declared = _section(env, "variables").get(alias, {})
+    section = _section(env, "variables")
+    declared = section.get(Spellings("name of the task", section).find(alias) or alias, {})
     return declared.get("name", alias), declared.get("unit")
 
 
@@ -364,11 +365,12 @@ class Columns:
         self._from: dict[str, tuple[str, Conversion]] = {}
         for column in log.columns:
             name, unit = declared_as(env, columns.get(column, column))
-            if name in self._variables:
-                own, units = self._variables[name], env.fmu.description.units
+            variable = env.fmu.description.find(name)
+            if variable is not None:
+                units = env.fmu.description.units
                 try:
-                    to_log = conversion_of(own, log.units.get(column) or unit, units)
-                    self._from[name] = column, to_log
+                    to_log = conversion_of(variable, log.units.get(column) or unit, units)
+                    self._from[variable.name] = column, to_log
                 except ConfigError as error:
                     raise ConfigError(f"column {column!r} of the log: {error}") from None
 

@@ -15,7 +15,7 @@ import fmpy
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.checks import integer_of
+from fmugym.checks import Spellings, integer_of
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.signals import ordinary
 
@@ -258,6 +258,9 @@ class ModelDescription:
             return self.variables[name]
         except ordinary(Exception):  # a KeyError; or something that is no key at all
             known = list(self.variables)
+        spelt = self._spellings.find(name)
+        if spelt is not None:
+            return self.variables[spelt]
         array, index = self._array_and_index(name)
         if array is None:
             raise unknown_name(f"variable of {self.model_name}", name, known)
@@ -272,7 +275,8 @@ class ModelDescription:
     def _array_and_index(self, name: Any) -> tuple[Variable | None, str]:
         """Take the name of an element apart; no array if it is not the name of one."""
         match = _ELEMENT.fullmatch(name) if isinstance(name, str) else None
-        array = None if match is None else self.variables.get(match[1])
+        spelt = None if match is None else self._spellings.find(match[1])
+        array = None if spelt is None else self.variables[spelt]
         return (array, match[2]) if array and match and array.shape else (None, "")
 
     def resized(self, sizes: Mapping[str, int]) -> ModelDescription:
@@ -284,7 +288,8 @@ class ModelDescription:
         Raises:
             ConfigError: If there is no such structural parameter, or it cannot have the value.
         """
-        chosen = {name: self._checked_size(name, size) for name, size in sizes.items()}
+        given = {self.variable(name).name: size for name, size in sizes.items()}
+        chosen = {name: self._checked_size(name, size) for name, size in given.items()}
         variables = {name: v.resized(chosen) for name, v in self.variables.items()}
         solved = self.model_exchange
         return replace(
@@ -323,6 +328,9 @@ class ModelDescription:
 
     def find(self, name: str) -> Variable | None:
         """Do what ``variable`` does, but return None if there is no such variable."""
+        spelt = self._spellings.find(name)
+        if spelt is not None:
+            return self.variables[spelt]
         try:
             return self.variable(name)
         except ConfigError:
@@ -338,11 +346,15 @@ class ModelDescription:
         Raises:
             ConfigError: If there is no such variable, or an array has too many elements.
         """
-        if isinstance(name, str) and name not in self.variables:
-            named = self._named_arrays.get(name)
-            if named is not None:
-                return named
+        if isinstance(name, str) and self._spellings.find(name) is None:
+            spelt = Spellings("array", self._named_arrays).find(name)
+            if spelt is not None:
+                return self._named_arrays[spelt]
         return self.variable(name).elements
+
+    @cached_property
+    def _spellings(self) -> Spellings:
+        return Spellings(f"variable of {self.model_name}", self.variables)
 
     @cached_property
     def _named_arrays(self) -> Mapping[str, tuple[Variable, ...]]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from fmugym.checks import KnownArguments, check_number
+from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
@@ -141,14 +141,20 @@ class Controller(KnownArguments, ABC):
     def _column(self, rows: FloatArray, signal: Signal) -> FloatArray:
         """The values of a signal, shape (N,)."""
         if isinstance(signal, str):
-            return rows[:, self.names.index(signal)]
+            return rows[:, self._place_of(signal)]
         return np.full(len(rows), signal)
 
     def _check_signal(self, what: str, signal: Signal) -> None:
         if not isinstance(signal, str):
             self._check_size(what, check_numbers(what, signal))
-        elif signal not in self.names:
+        elif Spellings("observation", self.names).find(signal) is None:
             raise ConfigError(unknown_name(f"observation in {what}", signal, self.names))
+
+    def _place_of(self, name: str) -> int:
+        """The place of an observation whose name is checked."""
+        if name in self.names:
+            return self.names.index(name)
+        return self.names.index(str(Spellings("observation", self.names).find(name)))
 
     def _check_size(self, what: str, numbers: Numbers | None) -> None:
         """Check that an array has one number for each environment."""

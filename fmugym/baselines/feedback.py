@@ -207,7 +207,7 @@ class LQR(Controller):
             raise ConfigError(f"no regulator stabilizes this model: {error}") from None
         if np.abs(np.linalg.eigvals(a - b @ self.gain)).max() >= 1:
             raise ConfigError("no regulator stabilizes this model; do its inputs move its states?")
-        self._places = [self.names.index(name) for name in self.of]
+        self._places = [self._place_of(name) for name in self.of]
 
     def _decide(self, rows: FloatArray) -> FloatArray:
         deviation = rows[:, self._places] - self.model.x0

@@ -147,7 +147,7 @@ class MPC(Controller):
         future = self._prototype.inside.future or Future({}, (), float)
         for name in self.states:
             self._check_signal("states", name)
-        self._places = list(map(self.names.index, self.states))
+        self._places = list(map(self._place_of, self.states))
         self._require_fit(future)
         self._foresight = _Foresight(self.names, future, self.time_step, steps)
         self._warm = self._bound_warm()

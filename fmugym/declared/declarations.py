@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import keyword
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import product
 from typing import Any, Final, TypeVar
@@ -13,6 +13,7 @@ import numpy as np
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY
+from fmugym.checks import normal_form
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_levels
 from fmugym.declared.expressions import CONSTANTS, Expression
@@ -29,8 +30,10 @@ from fmugym.declared.parts import (
 )
 from fmugym.declared.series import read_data
 from fmugym.declared.setpoints import SetPoints
+from fmugym.declared.spelling import as_declared
 from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, start_value
 from fmugym.declared.warming import read_warm_up
+from fmugym.errors import ConfigError
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
 
@@ -62,6 +65,8 @@ class Declarations:
         steps: Set points that jump, by name.
         actions: The variables that the agent writes.
         inputs: Inputs that expressions write, by alias.
+        places_of_inputs: Where the task says so.
+        name_of: Returns a name as it is declared.
         observed: The names that the agent sees, and where they stand.
         remembered: The names of which it sees the history.
         rewards, costs: By name; a reward without a table has the name ``""``.
@@ -75,6 +80,7 @@ class Declarations:
         self, root: Entry, description: ModelDescription, is_physical: bool = False
     ) -> None:
         """Read all sections, and note their mistakes, and what does not fit the FMU."""
+        root, self.name_of = as_declared(root, description)
         self.root, self.is_physical = root, is_physical
         self.variables = TaskVariables(root, description)
         self._declared = {one: None for name in NAMING[1:] for one in root.child(name).value or ()}
@@ -83,7 +89,8 @@ class Declarations:
         self.derived = _read(root, "expressions", read_derived)
         self.series = _read(root, "data", read_data)
         self._read_setpoints()
-        self.parameters = self._with_fitted(_read(root, "parameters", self._parameter))
+        parameters = _read(root, "parameters", self._parameter)
+        self.parameters = self._with_fitted({v.alias: (v, one) for v, one in parameters.values()})
         self.actions = self._read_actions()
         self.inputs = self._read_inputs()
         self.observed: list[tuple[Entry, str]] = []
@@ -92,7 +99,7 @@ class Declarations:
                 self._check_observed(entry)
                 self.observed.append((entry, entry.value))
         self.remembered = self._read_remembered()
-        self.warm_up = read_warm_up(root, self.actions, self._controlled())
+        self.warm_up = read_warm_up(root, self.actions, self._controlled(), self.name_of)
         reward = root.child("reward")
         if isinstance(reward.value, Expression):
             self.rewards = {"": Term(reward, reward.value)}
@@ -167,7 +174,10 @@ class Declarations:
             return False
         if name in self.written:
             return False
-        variable = self.variables.get(name)
+        try:
+            variable = self.variables.get(name)
+        except ConfigError:  # it may be several, which is told where the name is used
+            return False
         return variable is not None and variable not in self.actions
 
     def limits_of(self, name: str) -> Limits:
@@ -314,7 +324,7 @@ class Declarations:
         return not self.root.mistakes.explain(("agent", "actions"))
 
     def _read_inputs(self) -> dict[str, tuple[TaskVariable, Expression]]:
-        found = {}
+        found, self.places_of_inputs = {}, dict[str, Entry]()
         for name, series in self.series.items():
             target = series.entry.child("input")
             with target.noting():
@@ -322,7 +332,16 @@ class Declarations:
                     variable = self.variables.input_of(target, series.unit)
                     _require_plain_input(variable)
                     found[variable.alias] = variable, Expression.parse(name)
-        return found | _read(self.root, "inputs", self._input)
+                    self.places_of_inputs[variable.alias] = target
+        return found | {v.alias: (v, one) for v, one in self._read_expressions()}
+
+    def _read_expressions(self) -> Iterator[tuple[TaskVariable, Expression]]:
+        """The inputs that expressions write."""
+        for entry in self.root.child("inputs").items().values():
+            with entry.noting():
+                variable, expression = self._input(entry)
+                self.places_of_inputs[variable.alias] = entry
+                yield variable, expression
 
     def _input(self, entry: Entry) -> tuple[TaskVariable, Expression]:
         variable = self.variables.find(entry, entry.name, "input")
@@ -367,19 +386,22 @@ def _require_plain_input(variable: TaskVariable) -> None:
 
 def _check_names(root: Entry) -> None:
     """A name must mean one thing. Aliases may hide names of the FMU."""
-    seen: set[str] = set()
+    seen: dict[str, Entry] = {}
     for section in NAMING:
         for entry in root.child(section).items().values():
             with entry.noting():
                 _check_name(entry, seen)
-            seen.add(entry.name)
+            seen.setdefault(normal_form(entry.name), entry)
 
 
-def _check_name(entry: Entry, seen: Collection[str]) -> None:
-    name = entry.name
-    if name in seen:
-        raise entry.error(f"the name {name!r} is given twice")
-    if is_reserved(name):
+def _check_name(entry: Entry, seen: Mapping[str, Entry]) -> None:
+    name, first = entry.name, seen.get(normal_form(entry.name))
+    if first is not None:
+        raise entry.error(
+            f"the name {name!r} is given twice, also at {first.source.place(first.keys)}; rename "
+            "one of both, and what reads it"
+        )
+    if is_reserved(normal_form(name)):
         raise entry.error(f"{name!r} has a meaning of its own in expressions")
     if not name.isidentifier():
         raise entry.error(

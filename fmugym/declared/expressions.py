@@ -13,10 +13,11 @@ the trace that compiles hooks.
 from __future__ import annotations
 
 import ast
+import copy
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -112,7 +113,22 @@ class Expression:
             raise ConfigError(f"an expression has at most {_LONGEST} characters, got {len(value)}")
         tree = _parsed(value)
         _check_size(value, tree)
-        return cls(value, tree)
+        return cls(value, tree).renamed(lambda name: name)
+
+    def renamed(self, name_of: Callable[[str], str]) -> Expression:
+        """The same with other names.
+
+        Args:
+            name_of: Takes a name as it stands in the text, and returns the new one. Python's parser
+                gives names in their normal form.
+        """
+        if self.text.isascii():
+            return self
+        tree, text = copy.deepcopy(self.tree), self.text.strip()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Name):
+                node.id = name_of(ast.get_source_segment(text, node) or node.id)
+        return replace(self, tree=tree)
 
     @property
     def names(self) -> set[str]:

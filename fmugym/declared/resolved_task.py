@@ -92,6 +92,7 @@ class ResolvedTask:
     ) -> None:
         self._task, self._root, time_step, warm_steps = task, root, math.nan, 0
         self._declared = declared = Declarations(root, description, task.is_physical)
+        self._root = root = declared.root
         with root.child("reward").noting():
             if needs_reward and not declared.rewards:
                 text = 'the task has no reward; say one, for example: reward = "1"'
@@ -152,7 +153,7 @@ class ResolvedTask:
         for entry, expression, moment in self._plain_expressions():
             yield entry, partial(self._naming.value, entry, expression, moment)
         for name in declared.inputs:
-            yield self._place_of_input(name), partial(self._input_value, name)
+            yield declared.places_of_inputs[name], partial(self._input_value, name)
         for name, one in declared.derived.items():
             yield one.entry, partial(self._naming.value_of, name, Moment.JUDGED)
         for term in (*declared.rewards.values(), *declared.costs.values()):
@@ -314,18 +315,10 @@ class ResolvedTask:
             )
         return values
 
-    def _place_of_input(self, name: str) -> Entry:
-        """Where the task says what is written to an input: an expression, or data."""
-        entry = self._root.child("inputs").child(name)
-        given = (series.entry.child("input") for series in self._declared.series.values())
-        return (
-            entry if entry.value is not None else next((e for e in given if e.value == name), entry)
-        )
-
     def _input_value(self, name: str) -> Value:
         """The value of an input that an expression or data write, in the unit of the task."""
         variable, expression = self._declared.inputs[name]
-        entry = self._place_of_input(name)
+        entry = self._declared.places_of_inputs[name]
         value = self._naming.value(entry, expression, Moment.BEFORE).number
         check_written(entry, variable, value, self._declared.memory)
         return value

@@ -293,13 +293,24 @@ def _parsed(path: Path, text: str) -> dict[str, Any]:
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        lacks_quotes = re.search("Invalid value|Expected newline", str(error))
-        hint = "; texts and expressions stand in quotes" if lacks_quotes else ""
+        hint = _hint_of(text, str(error))
         raise ConfigError(f"{path.name} is no TOML file: {reason(error)}{hint}") from None
     except (ValueError, RecursionError):
         raise ConfigError(f"{path.name}: {_TOO_DEEP}") from None
     _require_shallow(document, f"{path.name}: ")
     return document
+
+
+def _hint_of(text: str, error: str) -> str:
+    """What is missing where the parser of TOML stumbles: quotation marks, mostly."""
+    if re.search("Invalid value|Expected newline", error):
+        return "; texts and expressions stand in quotes"
+    line = re.search(r"at line (\d+)", error)
+    lines = text.splitlines()
+    key = lines[int(line[1]) - 1].partition("=")[0].strip() if line else ""
+    if key.isascii():
+        return ""
+    return f"; keys of other letters than those of English stand in quotes: {shown(key)}"
 
 
 def _require_shallow(document: Any, place: str = "") -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY, Conversion, conversion_of
 from fmugym.archive.variable import Variable
+from fmugym.checks import Spellings, normal_form
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
 from fmugym.declared.mistakes import ConsequenceError
@@ -141,8 +142,12 @@ class TaskVariables:
     def get(self, alias: str) -> TaskVariable | None:
         """The variable of an alias or of a variable of the FMU; None if there is none."""
         known = self._variables.keys() | self._entries.keys()
+        if alias not in known and alias not in self._description.variables:
+            alias = Spellings("name", known).find(alias) or alias
         in_fmu = None if alias in known else self._description.find(alias)
-        if in_fmu is not None:
+        if in_fmu is not None and normal_form(in_fmu.name) == normal_form(alias):
+            alias = in_fmu.name
+        if in_fmu is not None and alias not in known:
             entry = self._root.child("variables").child(alias)
             self._variables[alias] = self._variable(alias, entry, in_fmu)
         return self._variables.get(alias)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from fmugym.checks import check_text, number_of
+from fmugym.checks import check_text, normal_form, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_controller
 from fmugym.declared.mistakes import ConsequenceError
@@ -51,7 +51,10 @@ def signals_of(controller: Controller) -> list[str]:
 
 
 def read_warm_up(
-    root: Entry, actions: Sequence[TaskVariable], controlled: Sequence[tuple[str, str]]
+    root: Entry,
+    actions: Sequence[TaskVariable],
+    controlled: Sequence[tuple[str, str]],
+    name_of: Callable[[str], str],
 ) -> WarmUpTable:
     """Read the warm-up of a task, and note its mistakes, such as a controller of no action.
 
@@ -59,6 +62,7 @@ def read_warm_up(
         root: The task.
         actions: Its actions.
         controlled: What is measured and its set point, in pairs, for a thermostat.
+        name_of: Returns a name as it is declared.
     """
     known = _named_controllers(root)
     entry = root.child("warm_up")
@@ -68,15 +72,22 @@ def read_warm_up(
     for name, one in _by_action(entry.child("controller"), actions).items():
         with one.noting():
             variable = _action_of(one, name, actions)
-            controllers[name] = (
+            controllers[variable.alias] = controller = (
                 _thermostat(one, variable, controlled)
                 if one.value in THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
-            check_controller(one, variable, controllers[name])
+            _rename(controller, name_of)
+            check_controller(one, variable, controller)
     return WarmUpTable(
         entry, entry.value.get("period", 0.0), controllers, entry.value.get("cache", False)
     )
+
+
+def _rename(controller: Controller, name_of: Callable[[str], str]) -> None:
+    for key in ("of", "setpoint"):
+        if isinstance(name := getattr(controller, key, None), str):
+            setattr(controller, key, name_of(name))
 
 
 def _named_controllers(root: Entry) -> dict[str, Entry]:
@@ -137,7 +148,7 @@ def _require_actions(entry: Entry) -> None:
 
 def _action_of(entry: Entry, name: str, actions: Sequence[TaskVariable]) -> TaskVariable:
     for variable in actions:
-        if variable.alias == name:
+        if normal_form(variable.alias) == normal_form(name):
             return variable
     _require_actions(entry)
     raise unknown_name("action", name, [variable.alias for variable in actions])

@@ -9,6 +9,7 @@ from typing import Any
 
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between, conversion_of
 from fmugym.archive.variable import Variable
+from fmugym.checks import Spellings
 from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
 from fmugym.errors import ConfigError, unknown_name
@@ -123,7 +124,9 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
     inside: Any = env.inside
     known = {one.name: one for one in inside.quantities().all}
     others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
-    for name, one in entry.child("tags").items().items():
+    spellings = Spellings("variable of the task", dict.fromkeys([*known, *others]))
+    for given, one in entry.child("tags").items().items():
+        name = spellings.find(given) or given
         if name in known:
             low, high = known[name].low, known[name].high
             yield _tag(env, name, one, known[name].unit, low=low, high=high, **_in_fmu(env, name))

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from fmugym.archive.texts import number_of, numbers_of
 from fmugym.archive.variable import Variable
+from fmugym.checks import normal_form
 from fmugym.env import FMUEnv
 from fmugym.errors import unknown_name
 from fmugym.pool.base import FloatArray, Pool
@@ -95,6 +96,7 @@ class Choice(NamedTuple):
 
 def matches(pattern: str, name: str) -> bool:
     """Whether a name matches a glob: * is any text, ? one character, brackets are themselves."""
+    pattern, name = normal_form(pattern), normal_form(name)
     expression = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
     return re.fullmatch(expression, name, re.DOTALL) is not None
 
@@ -141,8 +143,10 @@ def _found(pattern: str, known: Sequence[str], others: Iterable[str]) -> list[st
 
     The name of an array stands for its elements.
     """
-    found = [name for name in known if matches(pattern, name) or _array_of(name) == pattern]
-    found += [n for n in others if pattern in {n, _array_of(n)} and n not in found]
+    own = normal_form(pattern)
+    arrays = {name: _array_of(normal_form(name)) for name in (*known, *others)}
+    found = [name for name in known if matches(pattern, name) or arrays[name] == own]
+    found += [n for n in others if own in {normal_form(n), arrays[n]} and n not in found]
     if not found:
         raise unknown_name("variable to record", pattern, [*known, *others])
     return found

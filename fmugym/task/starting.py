@@ -75,8 +75,8 @@ def structural_values(description: ModelDescription, given: Mapping[str, Any]) -
     Raises:
         ConfigError: If one is a distribution: the sizes of spaces do not change.
     """
-    found = {n: v for n, v in given.items() if n in description.variables}
-    found = {n: v for n, v in found.items() if description.variables[n].is_structural}
+    known = {name: description.find(name) for name in given}
+    found = {n: given[n] for n, v in known.items() if v is not None and v.is_structural}
     for name, value in found.items():
         if is_distribution(value):
             raise ConfigError(

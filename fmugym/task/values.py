@@ -10,6 +10,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from fmugym.archive.texts import texts_of
+from fmugym.checks import Spellings
 from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_name
 from fmugym.signals import ordinary
 
@@ -86,16 +87,24 @@ class NamedValues(Mapping[str, Any]):
 
     def _array(self, name: Any) -> Any:
         places = self._arrays.get(str.__str__(name)) if isinstance(name, str) else None
+        spelt = None if places is not None else self._spelt(name)
+        if spelt is not None:
+            return self[spelt]
         if places is None:
             raise unknown_name(self._kind, name, self._index) from None
         values = self._get_values()
         return stacked([values[place] for place in places])
 
+    def _spelt(self, name: Any) -> str | None:
+        """The name of other letters that look the same; None if there is none."""
+        plain = str.__str__(name) if isinstance(name, str) else None
+        return Spellings(self._kind, {**self._index, **self._arrays}).find(plain)
+
     def __contains__(self, name: object) -> bool:
         if not isinstance(name, str):
             return False
         plain = str.__str__(name)
-        return plain in self._index or plain in self._arrays
+        return plain in self._index or plain in self._arrays or self._spelt(plain) is not None
 
     def get(self, name: str, default: Any = None) -> Any:
         """Return the value of a name, or the default if the name is unknown."""
@@ -141,7 +150,13 @@ class ParameterValues(dict[str, Any]):
     """
 
     def __missing__(self, name: Any) -> Any:
-        places = array_places(self).get(name) if isinstance(name, str) else None
+        arrays = array_places(self)
+        places = arrays.get(name) if isinstance(name, str) else None
+        spelt = (
+            None if places is not None else Spellings("parameter", {**self, **arrays}).find(name)
+        )
+        if spelt is not None:
+            return self[spelt]
         if places is None:
             raise UnknownParameterError(str(unknown_name("parameter", name, self)))
         values = list(self.values())
@@ -185,12 +200,18 @@ class EpisodeVariables(dict[str, Any]):
         super().__init__(dict.fromkeys(names))
 
     def __missing__(self, name: str) -> Any:
-        raise unknown_name("episode variable", name, self)
+        return super().__getitem__(self._spelt(name))
+
+    def _spelt(self, name: Any) -> str:
+        """The own name that is meant, also by other letters that look the same."""
+        spelt = Spellings("episode variable", self.keys()).find(name)
+        if spelt is None:
+            raise unknown_name("episode variable", name, self)
+        return spelt
 
     def __setitem__(self, name: str, value: Any) -> None:
-        if not isinstance(name, str) or name not in self:
-            raise unknown_name("episode variable", name, self)
-        super().__setitem__(name, value)
+        is_own = isinstance(name, str) and name in self
+        super().__setitem__(name if is_own else self._spelt(name), value)
 
     def update(self, *args: Any, **kwargs: Any) -> None:
         """Write several variables, as in a dict. If a name is unknown, nothing is written."""
@@ -198,10 +219,7 @@ class EpisodeVariables(dict[str, Any]):
             new = dict(*args, **kwargs)
         except ordinary(Exception):  # not a dict, or a dict whose methods fail
             raise ConfigError(f"{shown(args)} are no values by name") from None
-        for name in new:
-            if name not in self:
-                raise unknown_name("episode variable", name, self)
-        super().update(new)
+        super().update({self._spelt(name): value for name, value in new.items()})
 
     def __ior__(self, other: Any) -> EpisodeVariables:  # type: ignore[misc, override]  # dict overloads it
         self.update(other)

@@ -1,0 +1,193 @@
+"""Names whose letters only look the same: the micro sign, ligatures, umlauts of a Mac."""
+
+import unicodedata
+import zipfile
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import ConfigError, TaskError
+from fmugym.checks import Spellings
+
+MICRO, GREEK = "\u00b5_r", "\u03bc_r"
+NAMES = {
+    "micro": MICRO,
+    "ohm": "R_\u2126",
+    "kelvin": "T_\u212a",
+    "ligature": "e\ufb03ciency",
+    "decomposed": unicodedata.normalize("NFD", "Gr\u00f6\u00dfe"),
+    "greek": GREEK,
+    "composed": "Gr\u00f6\u00dfe",
+}
+FORMS = ("NFC", "NFD", "NFKC", "NFKD")
+
+
+def with_names(folder, **names):
+    """The pendulum with other names of its variables."""
+    source = fmugym.bundled_fmu("Pendulum", fmi_version="2.0")
+    path = folder / "model.fmu"
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(path, "w") as new:
+        for entry in old.infolist():
+            content = old.read(entry)
+            if entry.filename == "modelDescription.xml":
+                text = content.decode()
+                for name, other in names.items():
+                    assert f'name="{name}"' in text
+                    text = text.replace(f'name="{name}"', f'name="{other}"')
+                content = text.encode()
+            new.writestr(entry, content)
+    return path
+
+
+def task(fmu, name, **changes):
+    return {
+        "fmu": str(fmu),
+        "time_step": 0.02,
+        "variables": {"tau": {"min": -0.01, "max": 0.01}},
+        "parameters": {"q_0": 0.3},
+        "agent": {"actions": "tau", "observations": name},
+        "reward": f"-abs({name})",
+        **changes,
+    }
+
+
+def angle_and_reward(config):
+    with closing(fmugym.load(config)) as env:
+        observation, _ = env.reset(seed=0)
+        _, reward, *_ = env.step(env.action_space.low * 0)
+        return observation[0], reward
+
+
+@pytest.mark.parametrize("name", NAMES.values(), ids=NAMES)
+def test_a_variable_is_found_by_all_of_its_forms(name, tmp_path):
+    fmu = with_names(tmp_path, q=name)
+    found = [angle_and_reward(task(fmu, unicodedata.normalize(form, name))) for form in FORMS]
+    found.append(angle_and_reward(task(fmu, name)))
+    expected = pytest.approx(np.float32(0.3)), found[0][1]
+    assert found == [expected] * 5
+    assert expected[1] < 0
+
+
+@pytest.mark.parametrize(("declared", "used"), [(MICRO, GREEK), (GREEK, MICRO)])
+def test_names_of_a_task(declared, used):
+    """Each section declares a name, and each place uses it in other letters."""
+    config = {
+        "fmu": {"bundled": "Pendulum"},
+        "time_step": 0.1,
+        "variables": {
+            f"q{declared}": {"name": "q", "min": -4, "max": 4},
+            f"t{declared}": {"name": "tau", "min": -1, "max": 1},
+        },
+        "memory": {f"m{declared}": {"start": 1, "update": f"m{used} + 1"}},
+        "data": {f"d{declared}": {"values": [1, 2], "step": 1}},
+        "setpoints": {f"s{declared}": {"value": 1, "of": f"q{used}"}},
+        "expressions": {f"e{declared}": f"q{used} + m{used} + d{used} + s{used}_error"},
+        "agent": {
+            "actions": [f"t{used}"],
+            "observations": [f"q{used}", f"e{used}", f"s{used}_error"],
+            "forecast": {"of": [f"d{used}"], "horizon": "0.2s"},
+            "history": {"of": [f"q{used}"], "length": "0.1s"},
+        },
+        "warm_up": {
+            "period": "0.2s",
+            "controller": {f"t{used}": f"pid of=q{used} setpoint=s{used} kp=1"},
+        },
+        "reward": {f"r{declared}": f"-abs(e{used}) - previous(q{used})"},
+        "kpis": {f"k{declared}": {"sum": f"r{used}"}},
+        "terminated": f"m{used} > 3",
+    }
+    with closing(fmugym.load(config)) as env:
+        env.reset(seed=0)
+        ends = [env.step(env.action_space.sample()) for _ in range(3)]
+        assert [end[2] for end in ends] == [False, False, True]
+        assert env.observation_names[0] == f"q{declared}"
+
+
+def test_controllers_and_globs(tmp_path, ran):
+    file = tmp_path / "task.toml"
+    fmugym.Task.from_dict(
+        task(fmugym.bundled_fmu("Pendulum"), MICRO)
+        | {"variables": {MICRO: {"name": "q"}, "tau": {"min": -1, "max": 1}}}
+    ).write(file)
+    controller = f"pid of={GREEK} setpoint=1 kp=1"
+    output = tmp_path / "run.csv"
+    told = ran(
+        *("simulate", file, "--controller", controller, "--steps", 3),
+        *("--output", output, "--variables", f"{GREEK[0]}*"),
+    )
+    assert "3 steps" in told
+    assert MICRO in output.read_text(encoding="utf-8").splitlines()[0]
+
+
+class Angle(fmugym.FMUEnv):
+    def _is_done(self):
+        return False
+
+    def _reward_policy(self):
+        return -abs(self.out[GREEK]) + self.variables[GREEK] * self.parameters[GREEK + "0"]
+
+
+def test_a_class(tmp_path):
+    fmu = with_names(tmp_path, q=MICRO, q_0=MICRO + "0")
+    config = {
+        "model_input_names": "tau",
+        "bounds": {"tau": (-1, 1)},
+        "model_output_names": [GREEK],
+        "samplings": {MICRO: "mean"},
+        "model_parameters": {GREEK + "0": 0.3},
+        "episode_variables": {MICRO: 2.0},
+        "time_step": 0.02,
+    }
+    with closing(Angle(fmu, config)) as env:
+        observation, _ = env.reset(seed=0, options={"model_parameters": {GREEK + "0": 0.25}})
+        assert observation[0] == np.float32(0.25)
+        _, reward, *_ = env.step(np.float32([0.0]))
+        assert reward == pytest.approx(0.25, abs=0.05)
+        assert env.read_variables(GREEK)[MICRO] == pytest.approx(0.25, abs=0.01)
+
+
+def test_of_two_names_the_exact_one_counts(tmp_path):
+    fmu = with_names(tmp_path, q=MICRO, q_dot=GREEK)
+    angle, reward = angle_and_reward(task(fmu, MICRO))
+    assert angle == np.float32(0.3)
+    assert reward == pytest.approx(-0.3, abs=0.01)
+    speed, reward = angle_and_reward(task(fmu, GREEK))
+    assert speed == 0
+    assert reward != pytest.approx(-0.3, abs=0.1)
+
+
+def test_what_may_be_either_is_refused(tmp_path):
+    names = "\u212a\u00b5", "\u212a\u03bc"
+    fmu = with_names(tmp_path, q=names[0], q_dot=names[1])
+    with pytest.raises(ConfigError) as caught:
+        fmugym.load(task(fmu, "K\u03bc"))
+    assert str(caught.value).startswith("agent.observations: ")
+    for fact in (*map(ascii, names), ascii("K\u03bc"), "look the same"):
+        assert fact in str(caught.value)
+
+    config = task(fmu, "theta", reward="-K\u03bc")
+    with pytest.raises(TaskError, match=r"^reward: .*look the same"):
+        fmugym.load(config)
+
+
+@pytest.mark.parametrize("other", [MICRO, GREEK])
+def test_a_name_is_given_once(other):
+    config = task(fmugym.bundled_fmu("Pendulum"), "q", memory={MICRO: 1})
+    with pytest.raises(TaskError, match="given twice, also at memory"):
+        fmugym.load({**config, "data": {other: {"values": [1], "step": 1}}})
+
+
+def test_a_key_of_toml_needs_quotes(tmp_path):
+    file = tmp_path / "task.toml"
+    file.write_text('[variables]\n\u00b5 = { name = "q" }\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"line 2.*stand in quotes: '\u00b5'"):
+        fmugym.load(file)
+
+
+def test_spellings():
+    found = Spellings("name", dict.fromkeys(["a", MICRO, "e\ufb03ciency"]))
+    assert [found.find(n) for n in ("a", GREEK, "efficiency", "b", 3)] == [
+        *("a", MICRO, "e\ufb03ciency", None, None),
+    ]
