@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from operator import itemgetter
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -33,6 +34,10 @@ Signal = str | Numbers
 """An element of the observation by name, or a constant."""
 
 
+MakeSignal = Callable[[str, Sequence[str]], Callable[[Any], Any]]
+"""See ``Inside.signal_of``."""
+
+
 class Controller(KnownArguments, ABC):
     """A controller of one environment, or of the N environments of a vector environment.
 
@@ -46,6 +51,9 @@ class Controller(KnownArguments, ABC):
     """
 
     is_physical: ClassVar[bool] = True
+    _make_signal: MakeSignal | None
+    _signals: dict[str, Callable[[Any], Any]]
+
     space: spaces.Space[Any]
     names: tuple[str, ...]
     time_step: float
@@ -73,6 +81,7 @@ class Controller(KnownArguments, ABC):
         self.space = env.single_action_space if self._is_vector else env.action_space
         self.time_step = attribute_of(env, "config").time_step
         self.names = self._names_of(env) if names is None else tuple(names)
+        self._make_signal, self._signals = _maker_of_signals(env), {}
         self._prepare()
         self.reset()
         return self
@@ -141,14 +150,30 @@ class Controller(KnownArguments, ABC):
     def _column(self, rows: FloatArray, signal: Signal) -> FloatArray:
         """The values of a signal, shape (N,)."""
         if isinstance(signal, str):
-            return rows[:, self._place_of(signal)]
+            signals: FloatArray = self._signals[signal](rows)
+            return signals
         return np.full(len(rows), signal)
 
     def _check_signal(self, what: str, signal: Signal) -> None:
+        """Check a signal; one that is no name may be an expression, if a task is declared."""
         if not isinstance(signal, str):
             self._check_size(what, check_numbers(what, signal))
-        elif Spellings("observation", self.names).find(signal) is None:
-            raise ConfigError(unknown_name(f"observation in {what}", signal, self.names))
+        elif self._make_signal is None or signal.isidentifier() or self._is_name(signal):
+            self._check_name(what, signal)
+            self._signals[signal] = itemgetter((slice(None), self._place_of(signal)))
+        else:
+            try:
+                self._signals[signal] = self._make_signal(signal, self.names)
+            except ConfigError as error:
+                raise ConfigError(f"{what}: {error}") from None
+
+    def _check_name(self, what: str, name: str) -> None:
+        """Check the name of an observation."""
+        if not self._is_name(name):
+            raise ConfigError(unknown_name(f"observation in {what}", name, self.names))
+
+    def _is_name(self, name: str) -> bool:
+        return Spellings("observation", self.names).find(name) is not None
 
     def _place_of(self, name: str) -> int:
         """The place of an observation whose name is checked."""
@@ -187,6 +212,13 @@ class Controller(KnownArguments, ABC):
     def _shape(self) -> str:
         width = len(self.names)
         return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
+
+
+def _maker_of_signals(env: Any) -> MakeSignal | None:
+    """See ``Inside.signal_of``; None for what is no environment."""
+    base: Any = env.unwrapped
+    inside = getattr(base.inside.prototype if isinstance(base, VectorEnv) else base, "inside", None)
+    return getattr(inside, "signal_of", None)
 
 
 def limited(values: Any, low: Any, high: Any) -> Any:

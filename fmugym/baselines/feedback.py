@@ -196,7 +196,7 @@ class LQR(Controller):
 
     def _prepare(self) -> None:
         for name in self.of:
-            self._check_signal("of", name)
+            self._check_name("of", name)
         slopes = np.concatenate([self.model.A, self.model.B], axis=1)
         (a,), (b,) = discrete(slopes[np.newaxis], self.time_step)
         linalg = imported("scipy.linalg", "identification")

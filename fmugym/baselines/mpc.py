@@ -146,7 +146,7 @@ class MPC(Controller):
         self._prototype = self._copies.inside.prototype
         future = self._prototype.inside.future or Future({}, (), float)
         for name in self.states:
-            self._check_signal("states", name)
+            self._check_name("states", name)
         self._places = list(map(self._place_of, self.states))
         self._require_fit(future)
         self._foresight = _Foresight(self.names, future, self.time_step, steps)

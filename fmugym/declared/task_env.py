@@ -7,6 +7,7 @@ from types import MethodType
 from typing import Any, Final, Never
 
 from fmugym.declared.resolved_task import ResolvedTask
+from fmugym.declared.signals import signal_of
 from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
@@ -71,7 +72,7 @@ class TaskEnv(FMUEnv):
         with root.placing():
             resolved = ResolvedTask(self.task, root, description, needs_reward)
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
-        self.inside.controllers = resolved.controllers
+        self.inside.controllers, self.inside.signal_of = resolved.controllers, signal_of
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
         self.unphysical_keys, self.expressions = resolved.unphysical_keys, resolved.expressions
         if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from fmugym.checks import check_text, normal_form, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_controller
+from fmugym.declared.expressions import Expression
 from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.variables import TaskVariable
 from fmugym.errors import shown, unknown_name
@@ -45,7 +46,7 @@ class WarmUpTable:
 
 
 def signals_of(controller: Controller) -> list[str]:
-    """The names of what a controller measures, and of its set point."""
+    """What a controller measures, and its set point: names and other expressions."""
     given = (getattr(controller, name, None) for name in ("of", "setpoint"))
     return [name for name in given if isinstance(name, str)]
 
@@ -86,8 +87,8 @@ def read_warm_up(
 
 def _rename(controller: Controller, name_of: Callable[[str], str]) -> None:
     for key in ("of", "setpoint"):
-        if isinstance(name := getattr(controller, key, None), str):
-            setattr(controller, key, name_of(name))
+        if isinstance(signal := getattr(controller, key, None), str) and signal.isidentifier():
+            setattr(controller, key, name_of(signal))
 
 
 def _named_controllers(root: Entry) -> dict[str, Entry]:
@@ -180,7 +181,7 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
         if known and len(text.split()) == 1:
             raise unknown_name("controller", text, known)
         controller = controller_of(text)
-    for name in signals_of(controller):
-        if not name.isidentifier():
-            raise entry.error(f"{shown(name)} is no name of a variable; give it an alias")
+    with entry.placing():
+        for signal in signals_of(controller):
+            Expression.parse(signal)
     return controller

@@ -350,7 +350,7 @@ FILES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
     ({"variables": {"q": {"delay": "0.03s"}}}, ("delay", "0.03", "0.02")),
     ({"variables": {"q": {"drop_out": 2}}}, ("2", "between 0 and 1")),
     ({"variables": {"q": {"rate": -1}}}, ("rate", "-1", "positive")),
-    ({"variables": {"tau": {"min_on": "1"}}}, ("min_on", "'1'", "'15min'")),
+    ({"variables": {"tau": {"min_on": "1 hour"}}}, ("min_on", "'1 hour'", "'15min'")),
     ({"parameters": {"m": "a"}}, ("parameters.m", "'a'")),
     ({"parameters": {"m": [1]}}, ("m must be a number", "[1]")),
     ({"parameters": {"q": 1}}, ("'q'", "continuous output")),
