@@ -216,9 +216,9 @@ class Controller(KnownArguments, ABC):
 
 def _maker_of_signals(env: Any) -> MakeSignal | None:
     """See ``Inside.signal_of``; None for what is no environment."""
-    base: Any = env.unwrapped
-    inside = getattr(base.inside.prototype if isinstance(base, VectorEnv) else base, "inside", None)
-    return getattr(inside, "signal_of", None)
+    is_env = hasattr(env.unwrapped, "inside")
+    make: MakeSignal | None = attribute_of(env, "inside").signal_of if is_env else None
+    return make
 
 
 def limited(values: Any, low: Any, high: Any) -> Any:

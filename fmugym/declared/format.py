@@ -24,7 +24,7 @@ from fmugym.checks import (
 )
 from fmugym.config import CONFIG, FOREIGN
 from fmugym.declared.expressions import Expression
-from fmugym.declared.quantities import finite, number, number_or_distribution
+from fmugym.declared.quantities import constant_of, finite, number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown
 from fmugym.keys import COUNT as INTEGER
@@ -225,7 +225,7 @@ _DESCRIPTION: Final = {"description": Key(TEXT, "A description for readers.")}
 
 def _evaluated(check: Callable[[str, Any], Any], what: str, value: Any) -> Any:
     if isinstance(value, str):
-        number = Expression.parse(value).constant()
+        number = constant_of(what, value)
         value = int(number) if number.is_integer() else number
     return check(what, value)
 

@@ -8,12 +8,13 @@ from typing import Any
 
 from fmugym.checks import check_mapping, check_number, number_of
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression
+from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.mistakes import ConsequenceError
 from fmugym.distributions import as_distribution, is_distribution
+from fmugym.errors import ConfigError, nearest_name, shown
 from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["finite", "nearest_steps", "number", "number_or_distribution", "steps_in"]
+__all__ = ["constant_of", "finite", "nearest_steps", "number", "number_or_distribution", "steps_in"]
 
 
 def nearest_steps(length: float, step: float) -> int:
@@ -61,8 +62,25 @@ def number(what: str, value: Any) -> float:
         ConfigError: If it is neither.
     """
     if isinstance(value, str):
-        return Expression.parse(value).constant()
+        return constant_of(what, value)
     return number_of(what, value, may_be_boolean=True)
+
+
+def constant_of(what: str, text: str) -> float:
+    """The value of an expression of constants.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    expression = Expression.parse(text)
+    if expression.names <= CONSTANTS.keys():
+        return expression.constant()
+    near = nearest_name(text, [*CONSTANTS])
+    hint = "" if near is None else f"; did you mean {near!r}?"
+    raise ConfigError(
+        f"{what} must be a number, or an expression of constants such as '24 * pi / 180', got "
+        f"{shown(text)}{hint}"
+    )
 
 
 def finite(what: str, value: Any) -> float:

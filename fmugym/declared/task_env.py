@@ -6,8 +6,8 @@ import logging
 from types import MethodType
 from typing import Any, Final, Never
 
+from fmugym.declared.measuring import signal_of
 from fmugym.declared.resolved_task import ResolvedTask
-from fmugym.declared.signals import signal_of
 from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
