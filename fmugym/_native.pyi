@@ -98,6 +98,26 @@ def end_with(parent: int, /) -> bool:
         parent: The parent's process number.
     """
 
+def stop_tracing(process: int, stopped_by: int, /) -> None:
+    """Let a process go on that this one traces, and that a signal has stopped.
+
+    Args:
+        process: Its number, or that of a thread of it.
+        stopped_by: The number of the signal, which it gets now.
+    """
+
+def copy_arrays(targets: tuple[Array, ...], sources: tuple[Array, ...], /) -> None:
+    """Copy arrays of one or two dimensions into others of the same shapes and types.
+
+    Args:
+        targets: The arrays to copy into; the elements of a row have no gaps between them.
+        sources: The arrays to copy, likewise.
+
+    Raises:
+        TypeError: If one is no such array.
+        ValueError: If they differ in number or size, or one cannot be written.
+    """
+
 @final
 class Access:
     """A list of variables of one FMI version.

@@ -36,6 +36,10 @@ bool maker_take(Maker *maker, PyObject *arguments);
 bool maker_take_part(Maker *maker, const Maker *whole, int axes);
 void maker_drop(Maker *maker);
 
+/* A function of the module: copies arrays of one or two dimensions, whose rows have no gaps, into others
+ * of the same shapes and types. */
+PyObject *py_copy_arrays(PyObject *module, PyObject *args);
+
 /* Makes an array that the maker keeps no reference of. Returns NULL with an exception if memory runs
  * out. */
 PyObject *maker_make(const Maker *maker, char **memory);

@@ -32,5 +32,6 @@ bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char 
 PyObject *py_evaluate(PyObject *module, PyObject *args);
 PyObject *py_serve(PyObject *module, PyObject *args);
 PyObject *py_end_with(PyObject *module, PyObject *number);
+PyObject *py_stop_tracing(PyObject *module, PyObject *args);
 
 #endif

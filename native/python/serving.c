@@ -7,9 +7,12 @@
 
 #include "worker/worker.h"
 
-#if defined __linux__
+#if !defined _WIN32
 #include <signal.h>
+#endif
+#if defined __linux__
 #include <sys/prctl.h>
+#include <sys/ptrace.h>
 #endif
 #if !defined _WIN32
 #include <fcntl.h>
@@ -92,4 +95,20 @@ PyObject *py_end_with(PyObject *module, PyObject *number) {
 
     (void)module;
     return PyErr_Occurred() ? NULL : PyBool_FromLong(end_with(parent));
+}
+
+/* A process that is not let go waits for its tracer, so it is ended where that is unknown. */
+PyObject *py_stop_tracing(PyObject *module, PyObject *args) {
+    int process, stopped_by;
+
+    (void)module;
+    if (!PyArg_ParseTuple(args, "ii:stop_tracing", &process, &stopped_by)) {
+        return NULL;
+    }
+#if defined __linux__
+    ptrace(PTRACE_DETACH, process, NULL, (void *)(intptr_t)stopped_by);
+#elif !defined _WIN32
+    kill(process, SIGKILL);
+#endif
+    Py_RETURN_NONE;
 }

@@ -11,6 +11,7 @@
 #include <dlfcn.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+#include <unistd.h>
 #endif
 
 /* Shared memory */
@@ -34,7 +35,7 @@ static void *mapping_of(const wchar_t *name) {
     return mapping;
 }
 
-static char *map_memory(const Worker *w, const char *name, size_t size) {
+static char *map_memory(Worker *w, const char *name, size_t size) {
     wchar_t wide[4096];
 
     (void)w;
@@ -63,15 +64,18 @@ static bool load_before(const char *name, const char *path, char *error, size_t 
 
 #else
 
-/* Memory of another size than the request says would end this process later. */
-static char *map_memory(const Worker *w, const char *name, size_t size) {
+/* Memory of another size than the request says would end this process later. FMUs that write to a
+ * descriptor by mistake must not find this one. */
+static char *map_memory(Worker *w, const char *name, size_t size) {
     struct stat file;
+    void *memory = MAP_FAILED;
 
     (void)name;
-    if (fstat(w->memory, &file) != 0 || file.st_size < 0 || (size_t)file.st_size < size) {
-        return NULL;
+    if (fstat(w->memory, &file) == 0 && file.st_size >= 0 && (size_t)file.st_size >= size) {
+        memory = mmap(NULL, size, PROT_READ | PROT_WRITE, MAP_SHARED, w->memory, 0);
     }
-    void *memory = mmap(NULL, size, PROT_READ | PROT_WRITE, MAP_SHARED, w->memory, 0);
+    close(w->memory);
+    w->memory = -1;
     return memory == MAP_FAILED ? NULL : memory;
 }
 

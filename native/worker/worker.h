@@ -7,9 +7,8 @@
 #include "../requests.h"
 #include "frames.h"
 
-/* The block's part of the arrays that the processes share; see
- * fmugym/pool/process/shared_memory.py. Rows of inputs and outputs are stride elements apart, and
- * the others have no gaps. */
+/* The arrays that the process shares with its parent; see fmugym/pool/process/shared_memory.py. Rows
+ * of inputs and outputs are stride elements apart, and the others have no gaps. */
 typedef struct {
     char *base;
     size_t size, stride;
@@ -31,7 +30,7 @@ typedef struct Rolling Rolling;
 
 typedef struct {
     Channel channel;
-    int memory; /* the descriptor of the shared memory; not used on Windows */
+    int memory; /* the descriptor of the shared memory until it is mapped; not used on Windows */
     int64_t process; /* its number: an FMU may have forked it */
     Opening opening; /* from here to resets all is of an opened pool */
     Pool pool;

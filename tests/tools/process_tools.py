@@ -12,7 +12,10 @@ import model_tools
 import pytest
 from zoo_tools import CALLS, ZooEnv
 
-FAULTS = ("none", "crash", "abort", "exit", "hang", "close", "pause", "leak")
+FAULTS = (
+    *("none", "crash", "abort", "exit", "hang", "close", "pause", "leak", "scribble"),
+    *("traced", "traced by child", "traced and stop", "traced and crash"),
+)
 
 VARIABLES = (
     ("u", "input", 'start="0"'),

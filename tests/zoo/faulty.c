@@ -20,7 +20,10 @@
 #endif
 
 enum variable { U, Y, FAULT, STAGE, AT, VARIABLES };
-enum fault { NONE, CRASH, ABORT, LEAVE, HANG, CLOSE, PAUSE, LEAK };
+enum fault {
+    NONE, CRASH, ABORT, LEAVE, HANG, CLOSE, PAUSE, LEAK, SCRIBBLE,
+    TRACED, TRACED_BY_CHILD, TRACED_AND_STOP, TRACED_AND_CRASH
+};
 
 struct Animal {
     double values[VARIABLES];
@@ -30,8 +33,62 @@ struct Animal {
     void *environment;
 };
 
+#if defined __linux__
+
+#include <sys/ptrace.h>
+#include <sys/wait.h>
+
+/* A fork that holds this process, as libraries do that want no debugger. */
+static void let_a_child_trace(void) {
+    const pid_t me = getpid(), child = fork();
+
+    if (child == 0) {
+        ptrace(PTRACE_SEIZE, me, NULL, NULL);
+        for (;;) {
+            pause();
+        }
+    }
+    usleep(100000);
+}
+
+static void let_trace(int fault) {
+    if (fault == TRACED_BY_CHILD) {
+        let_a_child_trace();
+    } else {
+        ptrace(PTRACE_TRACEME, 0, NULL, NULL);
+    }
+    if (fault == TRACED_AND_STOP) {
+        raise(SIGSTOP);
+    } else if (fault == TRACED_AND_CRASH) {
+        raise(SIGSEGV);
+    }
+}
+
+#else
+
+static void let_trace(int fault) {
+}
+
+#endif
+
+/* Writes to descriptors that are not its own. */
+static void scribble(void) {
+    char bytes[2048];
+
+    memset(bytes, 0x40, sizeof bytes);
+    for (int descriptor = 3; descriptor < 512; descriptor++) {
+        if (write(descriptor, bytes, sizeof bytes) < 0) {
+            continue;
+        }
+    }
+}
+
 static void fail(Animal *me, int fault) {
     if (fault == NONE) {
+        return;
+    }
+    if (fault == SCRIBBLE) {
+        scribble();
         return;
     }
     me->logger(me->environment, me->name, ERROR, "last words", "this is fault %d", fault);
@@ -56,7 +113,10 @@ static void fail(Animal *me, int fault) {
     if (fault == PAUSE) {
         usleep(200000);
     }
-    for (volatile bool hanging = fault == HANG; hanging;) {
+    if (fault >= TRACED) {
+        let_trace(fault);
+    }
+    for (volatile bool hanging = fault == HANG || fault >= TRACED; hanging;) {
         usleep(1000);
     }
 }

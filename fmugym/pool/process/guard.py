@@ -217,12 +217,19 @@ class _Guard:
         return bool(poll.poll(_LOOK))
 
     def _bury(self) -> None:
-        """Report the exit status of each worker that has ended."""
+        """Report the exit status of each worker that has ended.
+
+        An FMU may have made the guard its tracer. Then a signal stops it until the guard lets go.
+        """
         with contextlib.suppress(BlockingIOError):
             os.read(self._ended, 4096)
         with contextlib.suppress(ChildProcessError):
-            while (ended := os.waitpid(-1, os.WNOHANG)) != (0, 0):
-                self._tell_end(*ended)
+            while (changed := os.waitpid(-1, os.WNOHANG)) != (0, 0):
+                pid, status = changed
+                if os.WIFSTOPPED(status):
+                    self._native.stop_tracing(pid, os.WSTOPSIG(status))
+                else:
+                    self._tell_end(pid, status)
 
     def _tell_end(self, pid: int, status: int) -> None:
         _kill_group(pid)

@@ -11,6 +11,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -36,7 +37,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.form import Writer
-from fmugym.pool.health import HealthArray
+from fmugym.pool.health import HealthArray, new_arrays
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
@@ -106,20 +107,22 @@ class ProcessPool(AskingPool):
             self.workers = min(num_instances, workers or available_processors())
             threads = threads or max(1, available_processors() // self.workers)
             setup = Setup.of(fmu, spec, num_instances, log, threads=threads, **options)
-            memory = _make_memory(spec, num_instances, self.workers)
+            setups = _share_out(setup, self.workers)
+            memories = _make_memories(spec, setups)
         except BaseException:
             fmu.close()
             raise
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
-        self._use(memory.arrays)
-        self._mask = memory.arrays.mask
-        self._arrays, self._plays, self._play = memory.arrays, 0, None
-        setups = _share_out(setup, self.workers)
+        single = self.workers == 1
+        arrays = memories[0].arrays if single else new_arrays(spec, num_instances)
+        self._use(arrays)
+        self._mask = arrays.mask
+        self._arrays, self._plays, self._play = arrays, 0, None
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._group = make_group(fmu, setups, memory, log, timeout, closing_time)
+        self._group = make_group(fmu, setups, memories, arrays, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._group)
 
     # The contract of Pool.
@@ -387,11 +390,16 @@ def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:
             check_count(what, count)
 
 
-def _make_memory(spec: PoolSpec, num_instances: int, workers: int) -> Memory:
-    try:
-        return Memory(spec, num_instances, workers)
-    except ordinary(OSError) as error:
-        raise FMULoadError(f"no memory can be shared with worker processes: {error}") from None
+def _make_memories(spec: PoolSpec, setups: Sequence[Setup]) -> list[Memory]:
+    """Make the memory of each worker."""
+    with ExitStack() as made:
+        try:
+            memories = [made.enter_context(closing(Memory(spec, one.count))) for one in setups]
+        except ordinary(OSError) as error:
+            text = f"no memory can be shared with worker processes: {error}"
+            raise FMULoadError(text) from None
+        made.pop_all()
+        return memories
 
 
 def _share_out(setup: Setup, workers: int) -> list[Setup]:

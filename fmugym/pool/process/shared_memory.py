@@ -1,4 +1,4 @@
-"""Arrays that several processes share, in memory without a name.
+"""Arrays that a worker shares with its parent, in memory without a name.
 
 Memory without a name in the file system is freed with the last process that uses it, however that
 process ends. Nothing has to be unlinked, and nothing can be left behind.
@@ -18,22 +18,20 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym._native import copy_arrays
 from fmugym.pool.health import Arrays, layout_of
 from fmugym.pool.spec import PoolSpec
 
 if sys.platform == "linux":
     import fcntl
 
-__all__ = ["ECHO_SIZE", "Memory"]
+__all__ = ["ECHO_SIZE", "Copies", "Memory"]
 
 _ALIGNMENT: Final = 64
 """The alignment of each array, in bytes: a cache line."""
 
 ECHO_SIZE: Final = 4096
 """Bytes for the last words of a worker's FMUs."""
-
-_OWN_SIZE: Final = ECHO_SIZE + _ALIGNMENT
-"""Bytes for a worker: its echo, and its bell."""
 
 _BELL: Final = np.dtype(np.uint64)
 
@@ -47,12 +45,11 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
 
 
 class Memory:
-    """What a pool and its workers share, filled with zeros.
+    """What a pool and one of its workers share, filled with zeros; no other worker can reach it.
 
     Args:
         spec: Names the inputs and outputs.
-        count: N.
-        workers: How many there are.
+        count: The number of the worker's instances.
 
     Raises:
         OSError: If the system refuses.
@@ -62,14 +59,15 @@ class Memory:
         descriptor: The file descriptor; -1 on Windows.
         tag: The name on Windows, which frees it together with the memory.
         map: The memory itself.
-        arrays: Those of all instances.
+        arrays: Those of the worker's instances.
     """
 
-    def __init__(self, spec: PoolSpec, count: int, workers: int) -> None:
+    def __init__(self, spec: PoolSpec, count: int) -> None:
         layout = layout_of(spec, count)
         sizes = [_padded_size(*row) for row in layout]
-        *self._offsets, self._end = itertools.accumulate(sizes, initial=0)
-        self.size = self._end + workers * _OWN_SIZE
+        *self._offsets, echo = itertools.accumulate(sizes, initial=0)
+        self._echo, self._bell = echo, echo + ECHO_SIZE
+        self.size = self._bell + _ALIGNMENT
         self.descriptor, self.tag = -1, ""
         if sys.platform == "win32":
             self.tag = f"fmugym-{os.getpid()}-{secrets.token_hex(8)}"
@@ -81,24 +79,64 @@ class Memory:
         arrays = [np.ndarray(*row, self.map, offset) for row, offset in places]
         self.arrays = Arrays(*arrays)
 
-    def offsets(self, worker: int) -> list[int]:
-        """Where the arrays begin, in the order of ``Arrays``, and then a worker's echo and bell."""
-        echo = self._end + worker * _OWN_SIZE
-        return [*self._offsets, echo, echo + ECHO_SIZE]
+    @property
+    def offsets(self) -> list[int]:
+        """Where the arrays begin, in the order of ``Arrays``, and then the echo and the bell."""
+        return [*self._offsets, self._echo, self._bell]
 
-    def echo(self, worker: int) -> npt.NDArray[np.uint8]:
-        """Where a worker's FMUs leave their last words, a text that ends with a zero byte."""
-        return np.ndarray(ECHO_SIZE, np.uint8, self.map, self.offsets(worker)[-2])
+    @property
+    def echo(self) -> npt.NDArray[np.uint8]:
+        """Where the worker's FMUs leave their last words, a text that ends with a zero byte."""
+        return np.ndarray(ECHO_SIZE, np.uint8, self.map, self._echo)
 
-    def bell(self, worker: int) -> memoryview:
-        """The count of the messages to a worker, as the only element of a view."""
-        return np.ndarray(1, _BELL, self.map, self.offsets(worker)[-1]).data
+    @property
+    def bell(self) -> memoryview:
+        """The count of the messages to the worker, as the only element of a view."""
+        return np.ndarray(1, _BELL, self.map, self._bell).data
 
     def close(self) -> None:
         """Close the file descriptor; the mapped memory stays as long as it is in use."""
         if self.descriptor >= 0:
             os.close(self.descriptor)
             self.descriptor = -1
+
+
+class Copies:
+    """Copies a block of the arrays of a pool to the memory of a worker, and back.
+
+    Args:
+        arrays: Those of the pool; nothing is copied if they are those of the memory.
+        block: The indices of the worker's instances.
+        memory: That of the worker.
+    """
+
+    def __init__(self, arrays: Arrays, block: slice, memory: Memory) -> None:
+        own = memory.arrays._asdict()
+        blocks = {
+            "inputs": arrays.inputs[:, block],
+            "mask": arrays.mask[block],
+            "counts": arrays.counts[block],
+            "outputs": arrays.outputs[:, block],
+            "observations": arrays.observations[block],
+            "statuses": arrays.statuses[block],
+        }
+        if arrays is memory.arrays:
+            blocks = {}
+        self._pairs = tuple(own[name] for name in blocks), tuple(blocks.values())
+        self._for_step = tuple(part[:3] for part in self._pairs)
+
+    def give(self) -> None:
+        """Copy what the worker may read or change."""
+        copy_arrays(*self._pairs)
+
+    def give_for_step(self) -> None:
+        """Copy what the worker reads in a step; it writes all the rest."""
+        copy_arrays(*self._for_step)
+
+    def take(self) -> None:
+        """Copy what the worker may have changed."""
+        shared, blocks = self._pairs
+        copy_arrays(blocks, shared)
 
 
 def _anonymous_file(size: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import os
 import socket
 import time
 from collections import deque
@@ -17,12 +18,13 @@ import numpy as np
 from fmugym.errors import FMULoadError, printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.form import Writer
+from fmugym.pool.health import Arrays
 from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.guard import LONGEST_START
 from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output, describe_exit, lines_of_echo
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Memory
+from fmugym.pool.process.shared_memory import Copies, Memory
 from fmugym.pool.reports import Receiver, loading_failed
 from fmugym.pool.requests import (
     Answer,
@@ -115,6 +117,7 @@ class Supervisor:
     Args:
         setup: What the worker needs to know.
         memory: Shared with the worker.
+        arrays: Those of all instances of the pool.
         log: Gets the FMU's messages.
 
     Attributes:
@@ -136,6 +139,7 @@ class Supervisor:
         self,
         setup: Setup,
         memory: Memory,
+        arrays: Arrays,
         log: logging.Logger,
     ) -> None:
         self.block = setup.block
@@ -150,8 +154,8 @@ class Supervisor:
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
-        self._echo = memory.echo(setup.number)
-        self._progress = memory.arrays.progress[setup.block]
+        self._echo, self._progress = memory.echo, memory.arrays.progress
+        self._copies = Copies(arrays, setup.block, memory)
         self._done = b""
         self._read: Callable[[Reader], Any] | None = None
         self._content = b""
@@ -224,8 +228,7 @@ class Supervisor:
             raise
         output.release_writing_ends()
         self._output = output
-        bell = self._memory.bell(setup.number)
-        return process, Channel(end, process.sentinel, output, bell)
+        return process, Channel(end, process.sentinel, output, self._memory.bell)
 
     def revive(self) -> None:
         """Start a process if there is none, with longer and longer pauses between deaths.
@@ -320,6 +323,7 @@ class Supervisor:
     def step(self, request: Request) -> None:
         """Ask the worker to step; failures show in the reply."""
         self.is_busy, self._asked, self._read = True, time.monotonic(), None
+        self._copies.give_for_step()
         try:
             if self.released:
                 self._release()
@@ -341,6 +345,7 @@ class Supervisor:
             read: Reads the answer; raises a ``DamagedError`` if it is none.
         """
         self.is_busy, self._asked, self._read = True, time.monotonic(), read
+        self._copies.give()
         self._output.pump()
         with Ignoring(OSError):
             if self.released:
@@ -391,6 +396,7 @@ class Supervisor:
         if self._opening:
             self.finish_opening(deadline)
         result = self._receive(deadline, doing, self._read)
+        self._copies.take()
         self.is_busy = False
         return result
 
@@ -540,11 +546,22 @@ def _refusals() -> Iterator[None]:
 
 
 def _is_debugged(pid: int) -> bool:
-    """Whether a debugger holds the process, which may then take its time; known on Linux only."""
+    """Whether a debugger holds the process, which may then take its time; known on Linux only.
+
+    An FMU may have itself traced, by its parent or by a fork of its process; they are no debuggers.
+    """
     try:
-        status = Path(f"/proc/{pid}/status").read_text()
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except ordinary(OSError):
         return False
-    return any(
-        line.startswith("TracerPid:") and line.split()[1] != "0" for line in status.splitlines()
-    )
+    told = {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    tracer = told["TracerPid"]
+    return tracer not in ("0", told["PPid"]) and _program(tracer) != _program(str(pid))
+
+
+def _program(process: str) -> str:
+    """The file of the program that a process runs; "" if it is another user's."""
+    try:
+        return os.readlink(f"/proc/{process}/exe")
+    except ordinary(OSError):
+        return ""

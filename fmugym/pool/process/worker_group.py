@@ -16,7 +16,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import MaskArray
-from fmugym.pool.health import Column
+from fmugym.pool.health import Arrays, Column
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.supervisor import (
@@ -40,7 +40,8 @@ class WorkerGroup:
     Args:
         fmu: The FMU; closed with the group.
         setups: What each worker needs to know.
-        memory: Shared with the workers; closed with the group.
+        memories: Each shared with a worker; closed with the group.
+        arrays: Those of all instances.
         log: Gets the FMU's messages.
         call_timeout: How long a call may take, in seconds; infinite for ever.
         closing_time: How long workers may take to free their instances at the end, in seconds.
@@ -61,17 +62,21 @@ class WorkerGroup:
         self,
         fmu: FMU,
         setups: Sequence[Setup],
-        memory: Memory,
+        memories: Sequence[Memory],
+        arrays: Arrays,
         log: logging.Logger,
         call_timeout: float,
         closing_time: float,
     ) -> None:
-        self.supervisors = [Supervisor(setup, memory, log) for setup in setups]
-        self.lost: MaskArray = np.zeros(len(memory.arrays.statuses), np.bool_)
+        self.supervisors = [
+            Supervisor(setup, memory, arrays, log)
+            for setup, memory in zip(setups, memories, strict=True)
+        ]
+        self.lost: MaskArray = np.zeros(len(arrays.statuses), np.bool_)
         self.refusal = ""
-        self._arrays, self.call_timeout = memory.arrays, call_timeout
+        self._arrays, self.call_timeout = arrays, call_timeout
         self.note_lost()
-        self._close = weakref.finalize(self, _close, self.supervisors, memory, fmu, closing_time)
+        self._close = weakref.finalize(self, _close, self.supervisors, memories, fmu, closing_time)
         _groups.add(self)
         self._open()
 
@@ -212,7 +217,9 @@ class WorkerGroup:
             supervisor.forget()
 
 
-def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, timeout: float) -> None:
+def _close(
+    supervisors: Sequence[Supervisor], memories: Sequence[Memory], fmu: FMU, timeout: float
+) -> None:
     deadline = time.monotonic() + timeout
     try:
         for supervisor in supervisors:
@@ -220,7 +227,8 @@ def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, timeout:
         for supervisor in supervisors:
             supervisor.close(deadline)
     finally:  # also after KeyboardInterrupt
-        memory.close()
+        for memory in memories:
+            memory.close()
         fmu.close()
 
 

@@ -149,7 +149,7 @@ def test_a_worker_of_another_version_refuses_to_open(monkeypatch):
 
 @linux_only
 def test_shared_memory_cannot_be_shrunk():
-    memory = Memory(PoolSpec((), (), 1.0), 1, 1)
+    memory = Memory(PoolSpec((), (), 1.0), 1)
     with open(memory.descriptor, "r+b", closefd=False) as file, pytest.raises(PermissionError):
         file.truncate(1)
     memory.map[memory.size - 1] = 1

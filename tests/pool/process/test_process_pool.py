@@ -201,6 +201,59 @@ class TestVector:
         assert len(processes_with(temp_root)) == 3
 
 
+@linux_only
+class TestTraced:
+    """An FMU that has itself traced: the guard is its parent, and no debugger."""
+
+    @pytest.mark.parametrize(
+        ("fault", "cause"),
+        [
+            ("traced", "took longer than call_timeout"),
+            ("traced by child", "took longer than call_timeout"),
+            ("traced and stop", "took longer than call_timeout"),
+            ("traced and crash", "SIGSEGV"),
+        ],
+    )
+    def test_its_episode_ends_and_others_go_on(self, make_pool, faulty, fault, cause):
+        other = make_pool(1)
+        set_up(other, faulty, ["none"])
+        pool = make_pool(2, call_timeout=0.7)
+        for _ in range(2):
+            set_up(pool, faulty, [fault, "none"], at=1)
+            assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+            assert cause in pool.failure(0)
+        set_up(pool, faulty, ["none"] * 2)
+        assert step(pool)[0][0].tolist() == [0.5, 0.5]
+        assert step(other)[0][0].tolist() == [0.5]
+
+
+@linux_only
+class TestReach:
+    """One worker can reach nothing of the others by mistake."""
+
+    def test_writes_to_descriptors_reach_nobody(self, make_pool, faulty):
+        pool = make_pool(3, workers=3)
+        set_up(pool, faulty, ["none", "scribble", "none"], at=1)
+        for number in (1, 2, 3):
+            outputs, statuses = step(pool)
+            assert statuses.tolist() == [Status.OK] * 3
+            assert outputs[0].tolist() == [0.5 * number] * 3
+            np.testing.assert_array_equal(pool.observations[:, 0], [0.5 * number] * 3)
+        assert pool.health()["steps"].tolist() == [3, 3, 3]
+
+    @pytest.mark.parametrize("workers", [1, 3])
+    def test_each_has_its_own_memory_and_descriptors(self, make_pool, workers):
+        pool = make_pool(3, workers=workers)
+        memories = []
+        for pid in pool.processes():
+            open_ones = sorted(int(one.name) for one in Path(f"/proc/{pid}/fd").iterdir())
+            assert open_ones[:3] == [0, 1, 2]
+            assert [one >= 512 for one in open_ones[3:]] == [True]
+            lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
+            memories += [line.split()[4] for line in lines if "memfd:fmugym" in line]
+        assert len(memories) == len(set(memories)) == workers
+
+
 @posix_only
 class TestShortages:
     """What the system refuses is blamed on the system; other workers' episodes go on."""
