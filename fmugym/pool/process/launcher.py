@@ -248,9 +248,10 @@ class _GuardedProcess:
     def exit_status(self, timeout: float) -> int | None:
         poll = select.poll()
         poll.register(self._lifeline, select.POLLIN)
-        if not poll.poll(1e3 * timeout):
-            return None
-        status = self._answer()
+        for _ in range(1 if self.pid else 2):  # before ``confirm``, the process number comes first
+            if not poll.poll(1e3 * timeout):
+                return None
+            status = self._answer()
         self.forget()
         return -signal.SIGKILL if status is None else status  # it went with its guard
 

@@ -41,7 +41,7 @@ from fmugym.pool.health import HealthArray, new_arrays
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
-from fmugym.pool.process.supervisor import A_STEP, RESET, ROLLOUT, Supervisor
+from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, ROLLOUT, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.requests import Answer, Reader, Request, request_listing
 from fmugym.pool.spec import ResetMethod
@@ -130,7 +130,7 @@ class ProcessPool(AskingPool):
     def _reset_some(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> None:
-        """Reset blocks; if a worker dies in it, a new worker tries again."""
+        """Reset blocks; if a worker dies in it, a new one tries again; if it is killed, another."""
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
@@ -138,7 +138,7 @@ class ProcessPool(AskingPool):
             if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
             self._retire_grown(concerned, mask)
-            for _ in range(2):
+            while concerned:
                 concerned = self._reset(concerned, variables, values, mask)
             self._group.note_lost()
 
@@ -149,9 +149,13 @@ class ProcessPool(AskingPool):
         values: FloatArray,
         mask: MaskArray,
     ) -> list[Supervisor]:
-        """Reset blocks; returns those that lost a used worker, since a new one may succeed."""
+        """Reset blocks; returns those that lost a worker in whose place a new one may succeed.
+
+        Either it was used before, or it was killed from outside.
+        """
         listing = request_listing(variables, self._version)
-        used = [s for s in supervisors if not s.is_new]
+        used = {s for s in supervisors if not s.is_new}
+        kills = {s: s.kills for s in supervisors}
         alive = self._group.revive(supervisors)
 
         def tell(supervisor: Supervisor) -> None:
@@ -164,7 +168,7 @@ class ProcessPool(AskingPool):
             supervisor.note_success()
             block = supervisor.block
             self._group.lost[block] &= ~mask[block]
-        return [s for s in used if s.is_new]
+        return [s for s in supervisors if (s in used and s.is_new) or s.kills > kills[s]]
 
     def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
         """End the workers that have played an episode, so that each episode has a new process."""
@@ -302,8 +306,9 @@ class ProcessPool(AskingPool):
                 for text in self._answers(
                     [supervisor], Request.FAILURE, content, lambda reader: tell(reader, within)
                 ):
-                    return f"{text}{supervisor.printed}"
-            return supervisor.reason
+                    if text or self.statuses[index] <= WARNING_CODE:
+                        return f"{text}{supervisor.printed}"
+            return supervisor.reason or INTERRUPTED
 
     def _answers(self, supervisors: Sequence[Supervisor], *question: Any) -> list[Any]:
         """Ask workers for what takes no time; see ``Supervisor.tell``."""

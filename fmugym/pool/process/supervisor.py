@@ -6,6 +6,7 @@ import contextlib
 import logging
 import math
 import os
+import signal
 import socket
 import time
 from collections import deque
@@ -39,6 +40,7 @@ from fmugym.signals import Ignoring, ordinary
 __all__ = [
     "A_STEP",
     "INSTANTIATION",
+    "INTERRUPTED",
     "RESET",
     "ROLLOUT",
     "Loss",
@@ -53,6 +55,7 @@ INSTANTIATION: Final = "the instantiation"
 RESET: Final = "a reset"
 A_STEP: Final = "a step"
 ROLLOUT: Final = "a rollout"
+INTERRUPTED: Final = "the call was interrupted"
 _SLOW: Final = (INSTANTIATION, RESET)
 """What may take ten times as long as other calls: models may need minutes to initialize."""
 
@@ -133,6 +136,7 @@ class Supervisor:
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
         initializations: How many initializations its processes have begun.
         losses: How processes died or hung, in their order.
+        kills: How many of them were killed from outside, as by the system if memory is short.
     """
 
     def __init__(
@@ -147,7 +151,7 @@ class Supervisor:
         self.generation = 0
         self.reason = ""
         self.losses: list[Loss] = []
-        self.initializations = 0
+        self.initializations = self.kills = 0
         self.growth = 0
         self.is_new = True
         self.released: deque[tuple[int, int]] = deque()
@@ -178,8 +182,9 @@ class Supervisor:
         Raises:
             LostError: If the system refuses.
         """
-        self.begin()
-        self.confirm()
+        with self._ending_if_interrupted():
+            self.begin()
+            self.confirm()
 
     def begin(self) -> None:
         """Begin to start a process; see ``confirm``.
@@ -187,11 +192,15 @@ class Supervisor:
         Raises:
             LostError: If the system refuses.
         """
-        with _refusals():
-            setup = self._setup.with_copy() if self._setup.needs_copy else self._setup
-            self._content = setup.opening(self._memory)
-            self._process, self._channel = self._launch(setup)
         self._opening = True
+        try:
+            with _refusals():
+                setup = self._setup.with_copy() if self._setup.needs_copy else self._setup
+                self._content = setup.opening(self._memory)
+                self._process, self._channel = self._launch(setup)
+        except LostError:
+            self._opening = False
+            raise
 
     def confirm(self) -> None:
         """Wait until the process is there, and tell it what to open.
@@ -264,6 +273,24 @@ class Supervisor:
         self._output.drain()
         self._forget_process(reason)
 
+    def interrupt(self) -> None:
+        """End the process, of which a call was interrupted; that is no death of its own."""
+        deaths = self._deaths
+        self.bury(INTERRUPTED)
+        self._opening = self.is_busy = False
+        self._deaths, self.reason = deaths, printable(f"{self._name}: {INTERRUPTED}")
+
+    @contextlib.contextmanager
+    def _ending_if_interrupted(self) -> Iterator[None]:
+        """End the process if a signal handler raises in the middle of its start or of its end."""
+        try:
+            yield
+        except LostError:
+            raise
+        except BaseException:
+            self.interrupt()
+            raise
+
     def _ends_by_itself(self, process: Process) -> bool:
         """Let a worker end that Wine may still be starting; see ``LONGEST_START``."""
         time_left = self._asked + LONGEST_START - time.monotonic()
@@ -284,8 +311,9 @@ class Supervisor:
     def retire(self, reason: str, deadline: float) -> None:
         """End a process that has not failed, in an orderly way."""
         deaths = self._deaths
-        self.begin_closing()
-        self.close(deadline)
+        with self._ending_if_interrupted():
+            self.begin_closing()
+            self.close(deadline)
         self._deaths, self.reason = deaths, printable(f"{self._name}: {reason}")
 
     def note_success(self) -> None:
@@ -495,6 +523,7 @@ class Supervisor:
             self._process.kill()
             self._process.exit_status(_LONGEST_KILL)
         status = status if self._fault is None else self._fault
+        self.kills += status == -signal.SIGKILL
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._note_loss(how)
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))

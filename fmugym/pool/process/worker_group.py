@@ -170,8 +170,8 @@ class WorkerGroup:
     def _stop_busy(self, supervisors: Iterable[Supervisor]) -> None:
         for supervisor in supervisors:
             if supervisor.is_busy:
-                supervisor.bury("the call was interrupted")
                 self.lost[supervisor.block] = True
+                supervisor.interrupt()
         self.note_lost()
 
     def note_lost(self) -> None:
@@ -192,8 +192,8 @@ class WorkerGroup:
     def retire(self, supervisor: Supervisor, reason: str) -> None:
         """End a worker that has not failed; its instances are lost until their reset."""
         block = supervisor.block
-        supervisor.retire(reason, self._deadline("its end"))
         self.lost[block] = True
+        supervisor.retire(reason, self._deadline("its end"))
         self._arrays.counts[block, [[Column.REPLACEMENTS], [Column.RECYCLINGS]]] += 1
 
     def of(self, index: int) -> Supervisor:

@@ -8,6 +8,7 @@ import gc
 import logging
 import os
 import pickle
+import re
 import signal
 import subprocess
 from pathlib import Path
@@ -33,8 +34,11 @@ from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import guard, launcher
+from fmugym.pool.process import supervisor as supervising
 from fmugym.pool.process.launcher import _guard
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.requests import Request
+from fmugym.pool.spec import ResetMethod
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -252,6 +256,127 @@ class TestReach:
             lines = Path(f"/proc/{pid}/maps").read_text().splitlines()
             memories += [line.split()[4] for line in lines if "memfd:fmugym" in line]
         assert len(memories) == len(set(memories)) == workers
+
+
+@posix_only
+class TestInterrupted:
+    """Ctrl-C while workers start or end: the text says so, and the next reset works."""
+
+    @pytest.fixture(name="interrupt")
+    def fixture_interrupt(self, monkeypatch):
+        """Let a function be interrupted once, before it does its work or after it."""
+
+        def interrupt(owner, name, when, call=1):
+            function, calls = getattr(owner, name), []
+
+            def interrupted(*args, **options):
+                calls.append(name)
+                if when == "before" and len(calls) == call:
+                    raise KeyboardInterrupt
+                result = function(*args, **options)
+                if when == "after" and len(calls) == call:
+                    raise KeyboardInterrupt
+                return result
+
+            monkeypatch.setattr(owner, name, interrupted)
+
+        return interrupt
+
+    @pytest.mark.parametrize(
+        ("owner", "name", "when"),
+        [
+            (supervising, "launch", "before"),
+            (launcher._GuardedProcess, "confirm", "before"),
+            (launcher._GuardedProcess, "confirm", "after"),
+            (supervising.Supervisor, "begin", "after"),
+            (supervising.Supervisor, "tell", "after"),
+            (supervising.Supervisor, "finish_opening", "before"),
+        ],
+    )
+    def test_a_start(self, make_pool, faulty, interrupt, monkeypatch, owner, name, when):
+        monkeypatch.setattr(supervising.Supervisor, "start_ahead", lambda _: None)
+        pool = make_pool(3, workers=3)
+        set_up(pool, faulty, ["crash", "none", "crash"], at=1)
+        step(pool)
+        interrupt(owner, name, when)
+        with pytest.raises(KeyboardInterrupt):
+            set_up(pool, faulty, ["none"] * 3)
+        for index in range(3):
+            if pool.statuses[index]:
+                assert re.search("SIGSEGV|interrupted", pool.failure(index))
+        set_up(pool, faulty, ["none"] * 3)
+        assert step(pool)[0][0].tolist() == [0.5] * 3
+        assert all(pool.processes())
+
+    @pytest.mark.parametrize("name", ["begin_closing", "reply", "bury", "start", "confirm"])
+    @pytest.mark.parametrize("call", [1, 2])
+    def test_an_end(self, opened, faulty, interrupt, name, call):
+        """Each reset ends the workers."""
+        fmu = FMU(faulty)
+        spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), time_step=0.5)
+        spec = spec.beginning_by(ResetMethod.PROCESS)
+        pool = opened(ProcessPool(fmu, spec, 2, LOG, workers=2))
+        set_up(pool, faulty, ["none"] * 2)
+        interrupt(supervising.Supervisor, name, "before", call)
+        with pytest.raises(KeyboardInterrupt):
+            set_up(pool, faulty, ["none"] * 2)
+        assert all(pool.failure(index) for index in range(2) if pool.statuses[index])
+        set_up(pool, faulty, ["none"] * 2)
+        assert step(pool)[0][0].tolist() == [0.5] * 2
+
+    def test_is_no_death(self, make_pool, faulty, interrupt):
+        """An FMU is given up after five deaths in a row, but not after as many interrupts."""
+        pool = make_pool()
+        for number in range(1, 8):
+            interrupt(supervising.Supervisor, "reply", "before")
+            with pytest.raises(KeyboardInterrupt):
+                set_up(pool, faulty, ["none"])
+            assert "interrupted" in pool.failure(0), number
+        set_up(pool, faulty, ["none"])
+        assert step(pool)[0][0].tolist() == [0.5]
+
+
+@posix_only
+class TestKilledFromOutside:
+    """The system kills a worker, and its successors, too."""
+
+    @pytest.fixture(name="killing")
+    def fixture_killing(self, monkeypatch):
+        """Kill workers that get a request, so many times."""
+
+        def killing(request, times):
+            tell, left = supervising.Supervisor.tell, [times]
+
+            def tell_and_kill(supervisor, told, *arguments):
+                if told == request and left[0] > 0:
+                    left[0] -= 1
+                    os.kill(supervisor.pid, signal.SIGKILL)
+                tell(supervisor, told, *arguments)
+
+            monkeypatch.setattr(supervising.Supervisor, "tell", tell_and_kill)
+
+        return killing
+
+    @pytest.mark.parametrize("request_", [Request.OPEN, Request.RESET])
+    def test_others_go_on(self, faulty, make_envs, killing, request_):
+        """One episode of a vector environment ends, and the next one begins."""
+        envs = make_envs(lambda: FaultyEnv(faulty), 3, workers=3)
+        envs.reset()
+        envs.step(np.ones((3, 1), np.float32))
+        os.kill(envs.inside.pool.processes()[1], signal.SIGKILL)
+        killing(request_, 2)
+        truncated, infos = envs.step(np.ones((3, 1), np.float32))[3:]
+        assert truncated.tolist() == [False, True, False]
+        assert "SIGKILL" in infos["fault"][1]
+        observations, _, _, truncated, _ = envs.step(np.ones((3, 1), np.float32))
+        assert observations[:, 0].tolist() == [1.5, 0.0, 1.5]
+        assert truncated.tolist() == [False] * 3
+
+    def test_not_for_ever(self, faulty, make_env, killing):
+        env = make_env()
+        killing(Request.RESET, 100)
+        with pytest.raises(SimulationError, match=r"given up after 5 deaths in a row: .*SIGKILL"):
+            env.reset()
 
 
 @posix_only
