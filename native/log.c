@@ -82,8 +82,8 @@ uint64_t log_environment(const Log *log, size_t index) {
 }
 
 void log_name(char *name, const char *model, uint64_t environment) {
-    snprintf(name, LOG_NAME, "%.120s_%u_%u", model, (unsigned)(environment >> INDEX_BITS),
-             (unsigned)(environment & UINT32_MAX));
+    snprintf(name, LOG_NAME, "%.110s_%u_%u_%u", model, (unsigned)number_of_process(),
+             (unsigned)(environment >> INDEX_BITS), (unsigned)(environment & UINT32_MAX));
 }
 
 void message_free(Message *message) {

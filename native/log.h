@@ -53,7 +53,8 @@ void log_close(Log *log);
 /* The number that identifies the first part of an instance to FMUs: it combines log and instance.
  * Those of the other parts follow. */
 uint64_t log_environment(const Log *log, size_t index);
-/* Writes a name that tells FMI 1.0 and 2.0 the same; it is shorter than LOG_NAME bytes. */
+/* Writes a name that tells FMI 1.0 and 2.0 the same, and that no instance of another process has: FMUs name
+ * files by it. It is shorter than LOG_NAME bytes. */
 enum { LOG_NAME = 160 };
 void log_name(char *name, const char *model, uint64_t environment);
 

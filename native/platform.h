@@ -13,6 +13,7 @@
 #else
 #include <pthread.h>
 #include <time.h>
+#include <unistd.h>
 #endif
 
 #if defined _MSC_VER || defined FMUGYM_INTERLOCKED
@@ -21,6 +22,14 @@
 #define FMUGYM_STDATOMIC
 #include <stdatomic.h>
 #endif
+
+static inline int64_t number_of_process(void) {
+#if defined _WIN32
+    return (int64_t)GetCurrentProcessId();
+#else
+    return (int64_t)getpid();
+#endif
+}
 
 /* In bytes. Data that several threads write gets its own cache lines. */
 enum { CACHE_LINE = 64 };

@@ -39,12 +39,20 @@ from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.archive.variable import Variable
+from fmugym.caching import is_own
 from fmugym.checks import KnownArguments, check_mapping, check_number, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, plain, printable, shown, warn_once
 from fmugym.signals import ordinary
 from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
-__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU", "copy_libraries", "file_digest"]
+__all__ = [
+    "DEFAULT_PROBE_TIMEOUT",
+    "FMU",
+    "StandsForFMU",
+    "copy_libraries",
+    "extracted_again",
+    "file_digest",
+]
 
 logger = logging.getLogger(__name__)
 
@@ -89,6 +97,7 @@ class FMU(KnownArguments):
         sizes: As given.
         in_wine: Whether the library is one for Windows that can only run in Wine here.
         isolated: Whether it is a system that shall run in worker processes.
+        extractions: How often files were missing, which are then extracted or copied anew.
 
     Raises:
         ConfigError: If an argument does not fit.
@@ -99,6 +108,7 @@ class FMU(KnownArguments):
     sizes: Mapping[str, int] = MappingProxyType({})
     in_wine = False
     isolated = False
+    extractions = 0
 
     def __init__(
         self,
@@ -360,17 +370,19 @@ class FMU(KnownArguments):
         return f"binaries/{self.platform}/{self.description.model_identifier}{suffix}"
 
     def extract(self) -> Path:
-        """Extract what this machine needs, once, into a temporary folder.
+        """Extract what this machine needs into a temporary folder.
 
         The folder is removed by ``close``, with this object, or at the end of the interpreter.
+        Later calls extract anew what a cleaner of temporary files has removed meanwhile.
 
         Returns:
-            The folder.
+            The folder, always the same one.
 
         Raises:
             FMULoadError: If there is no library for this platform or the archive is damaged.
         """
         if self._folder is not None:
+            self._extract_again(self._folder)
             return self._folder
         self._check_library()
         folder = folder_name()
@@ -383,6 +395,25 @@ class FMU(KnownArguments):
             raise
         self._folder = folder
         return folder
+
+    @property
+    def is_extracted(self) -> bool:
+        """Whether it was extracted, and not closed since."""
+        return self._folder is not None
+
+    def _extract_again(self, folder: Path) -> None:
+        """Extract what is missing in the folder."""
+        if not folder.exists():
+            make_folder(folder)
+        elif not is_own(folder):
+            raise FMULoadError(f"{folder}, the folder of {self.path.name}, belongs to another user")
+        if self._extract_to(folder):
+            self.extractions += 1
+            logger.warning(
+                "%s: files were missing in its temporary folder %s and are extracted anew",
+                printable(self.path.name),
+                folder,
+            )
 
     def _check_library(self) -> None:
         """Look at the library inside the archive: nothing is written if it cannot be loaded."""
@@ -420,11 +451,27 @@ class FMU(KnownArguments):
             return ""
         return f". It has its source code: fmugym info --repair {shlex.quote(self.path.name)}"
 
-    def _extract_to(self, folder: Path, only: str = "") -> None:
-        """Extract the files that are needed, or those of one folder of them."""
+    def _extract_to(self, folder: Path, only: str = "") -> bool:
+        """Extract the files that are needed and not there; returns whether there are any.
+
+        Args:
+            folder: Where to.
+            only: The one folder of the archive whose files are needed; by default several are.
+        """
         files = {p: self._target(p) for p in self._archive.files if self._needed(p, only)}
         folders = [self._target(p) for p in self._archive.folders if self._needed(p, only)]
-        self._archive.extract(folder, files, [*folders, "resources"])  # tools pass its path always
+        folders.append("resources")  # tools pass its path always
+        files = {p: target for p, target in files.items() if _is_missing(folder, target)}
+        folders = [target for target in folders if _is_missing(folder, target)]
+        if not files and not folders:
+            return False
+        try:
+            self._archive.extract(folder, files, folders)
+        except BaseException:  # a file that is cut short would pass for one that is there
+            for target in files.values():
+                (folder / target).unlink(missing_ok=True)
+            raise
+        return True
 
     def _needed(self, place: str, only: str) -> bool:
         first, _, rest = place.partition("/")
@@ -453,16 +500,42 @@ class FMU(KnownArguments):
             finalizer.detach()  # not before: a signal may have interrupted the removal
 
 
+def _is_missing(folder: Path, target: str) -> bool:
+    return not os.path.exists(os.path.join(folder, target))  # a Path would take three times as long
+
+
 def copy_libraries(fmu: FMU, count: int) -> list[Path]:
-    """Copy the libraries of all parts, so that each instance has global variables of its own."""
+    """Copy the libraries of all parts, so that each instance has global variables of its own.
+
+    Copies that are there stay as they are.
+    """
     copies = [
-        _copy_library(place, Path(part.library), count)
+        _copy_library(fmu, place, Path(part.library), count)
         for part, place in fmu.parts_in(fmu.extract())
     ]
     return [path for paths in zip(*copies, strict=True) for path in paths]
 
 
-def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
+def extracted_again(fmu: FMU, copies: int) -> bool:
+    """Extract missing files of an FMU anew; returns whether there were any.
+
+    Args:
+        fmu: The FMU; nothing happens if it is closed.
+        copies: How many copies of its libraries there are to be, too.
+
+    Raises:
+        FMULoadError: As ``FMU.extract``.
+    """
+    before = fmu.extractions
+    if not fmu.is_extracted:
+        return False
+    fmu.extract()
+    if copies:
+        copy_libraries(fmu, copies)
+    return fmu.extractions > before
+
+
+def _copy_library(fmu: FMU, folder: Path, library: Path, count: int) -> list[Path]:
     """Copy the library's folder: the system treats files with other paths and inodes as new.
 
     The copies are in the FMU's temporary folder and are deleted with it.
@@ -471,7 +544,9 @@ def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
     try:
         for index in range(count):
             copy = folder / "private" / str(index)
-            shutil.copytree(folder / library.parent, copy)
+            if not (copy / library.name).exists():
+                fmu.extractions += 1
+                shutil.copytree(folder / library.parent, copy, dirs_exist_ok=True)
             paths.append(copy / library.name)
     except ordinary(OSError, shutil.Error) as error:
         raise FMULoadError(

@@ -247,6 +247,14 @@ class Pool(ABC):
         """Whether ``roll_out`` does many steps of compiled hooks in one call."""
         return self.plays_alone
 
+    def extract(self) -> bool:
+        """Extract the FMU's files anew that have been removed; returns whether there were any.
+
+        Raises:
+            FMULoadError: If the FMU has been removed or changed, too.
+        """
+        return False
+
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """Prepare steps with compiled hooks.
 

@@ -44,6 +44,10 @@ _REFUSAL: Final = re.compile(
 _SAID: Final = re.compile(r"(?:the FMU said|its last lines|it printed): ")
 """What comes before an FMU's words in the texts of errors."""
 
+_EXTRACTED: Final = (
+    "; files of the FMU were missing in its temporary folder and are there again: reset once more"
+)
+
 _FIRST_PAUSE: Final = 0.5
 _LONGEST_PAUSE: Final = 10.0
 """Seconds between two attempts to get a licence."""
@@ -99,7 +103,7 @@ def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:
         SimulationError: If one has failed; a ``LicenceError`` if the FMU speaks of a licence.
     """
     for index in indices[pool.statuses[indices] > WARNING_CODE].tolist():
-        failure = f"{doing}{pool.failure(index)}"
+        failure = f"{doing}{pool.failure(index)}{_EXTRACTED if pool.extract() else ''}"
         error = LicenceError if speaks_of_licence(failure) else SimulationError
         raise error(failure if pool.num_instances == 1 else f"environment {index}: {failure}")
 

@@ -10,6 +10,7 @@ write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.s
 from __future__ import annotations
 
 import logging
+import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, ParamSpec, TypeVar
@@ -18,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.fmu import FMU, copy_libraries
+from fmugym.archive.fmu import FMU, copy_libraries, extracted_again
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
@@ -52,6 +53,9 @@ from fmugym.signals import ordinary
 __all__ = ["NativePool", "prepare"]
 
 _MOST_CACHED: Final = 64
+
+_BETWEEN_LOOKS: Final = 1e-3
+"""Seconds between two looks for the FMU's files in steps; a look takes some microseconds."""
 
 ask_for_texts(_native.text_with)
 
@@ -106,6 +110,7 @@ class NativePool(AskingPool):
         self._result = self.outputs, self.statuses
         self._fmu, self._spec = fmu, spec
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
+        self._looked = 0.0
         try:
             self._pool = self._open(log, private_libraries)
         except BaseException:
@@ -117,13 +122,17 @@ class NativePool(AskingPool):
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self._watched(self._pool.reset)
-        self._watched_play = self._watched(self._pool.play), self._watched(self._pool.reset_by)
+        self._starting_play = tuple(
+            self._with_files(self._watched(function))
+            for function in (self._pool.play, self._pool.reset_by)
+        )
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
         paths = fmu.prepare_libraries()
         if private_libraries:
             paths = copy_libraries(fmu, self.num_instances)
+        self._private = private_libraries
         form = form_of_pool(
             description,
             spec,
@@ -269,17 +278,34 @@ class NativePool(AskingPool):
             raise SimulationError("the pool is closed")
         return self._pool
 
-    def _reset_some(
+    def _reset_once(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
-    ) -> None:
-        """See ``RetryingPool._reset_some``."""
+    ) -> int:
+        """See ``RetryingPool._reset_once``."""
         access = self._accesses.get(variables) or self._access(variables)
         try:
-            self._reset(access, values, mask, None)
+            return self._reset(access, values, mask, None)
         except (TypeError, BufferError, ValueError) as error:
             require_refusal(error)
             self._open_pool()
-            self._reset(access, np.asarray(values, np.float64), _as_mask(mask), None)
+            return self._reset(access, np.asarray(values, np.float64), _as_mask(mask), None)
+
+    def extract(self) -> bool:
+        """See ``Pool.extract``."""
+        self._looked = time.monotonic()
+        return extracted_again(self._fmu, self.num_instances if self._private else 0)
+
+    def _with_files(self, function: Callable[P, R]) -> Callable[P, R]:
+        """See to the FMU's files before a function that may make instances anew."""
+        if not self._spec.makes_anew:
+            return function
+
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            if time.monotonic() > self._looked + _BETWEEN_LOOKS:
+                self.extract()
+            return function(*args, **kwargs)
+
+        return call
 
     # Steps with compiled hooks.
 
@@ -287,7 +313,7 @@ class NativePool(AskingPool):
         """See ``Pool.prepare_play``; the memory that resets allocate is added to the growth."""
         pool = self._pool
         prepare(pool, self._access(variables), *parts)
-        step, reset = self._watched_play
+        step, reset = self._starting_play
         return Play(pool.play_before, pool.play_after, pool.play, step, reset)
 
     def roll_out(self, *arrays: Any) -> int:

@@ -6,12 +6,12 @@ import contextlib
 import logging
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import LicenceError
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import CountedPool
 from fmugym.pool.licences import refusals, wait_for_licence
@@ -61,11 +61,21 @@ class RetryingPool(CountedPool):
             self._reset_patiently(*self._told, variables, values, mask)
         return self.outputs, self.statuses
 
-    @abstractmethod
     def _reset_some(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
-    ) -> Any:
-        """Do what ``reset`` does, once."""
+    ) -> None:
+        """Reset instances; those that have failed without files of the FMU are reset with them."""
+        if self._spec.makes_anew:
+            self.extract()
+        if self._reset_once(variables, values, mask) and self.extract():
+            failed = self._as_mask(mask) & (self.statuses > WARNING_CODE)
+            self._reset_once(variables, values, failed)
+
+    @abstractmethod
+    def _reset_once(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> int:
+        """Do what ``reset`` does, once; returns how many instances have trouble."""
 
     def _reset_patiently(
         self,

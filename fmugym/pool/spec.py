@@ -195,6 +195,11 @@ class PoolSpec:
         return ResetMethod.RESET if self.component_resets else self.reset_method
 
     @property
+    def makes_anew(self) -> bool:
+        """Whether resets make instances anew."""
+        return any(one not in REUSING for one in (self.reset_method, *self.component_resets))
+
+    @property
     def reloads(self) -> bool:
         """Whether anything is loaded anew, which must be a private copy then."""
         return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)

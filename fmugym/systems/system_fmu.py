@@ -122,12 +122,14 @@ class SystemFMU(FMU):
             with _naming(component):
                 fmu._check_library()
 
-    def _extract_to(self, folder: Path, only: str = "") -> None:
+    def _extract_to(self, folder: Path, only: str = "") -> bool:
         """Extract each FMU into a folder of its own."""
+        extracted = False
         for component, (fmu, own) in zip(self.plan.components, self.parts_in(folder), strict=True):
             with _naming(component):
-                own.mkdir()
-                fmu._extract_to(own, only)
+                own.mkdir(exist_ok=True)
+                extracted |= fmu._extract_to(own, only)
+        return extracted
 
 
 def _opened(components: Iterable[Component]) -> Iterator[FMU]:

@@ -5,17 +5,6 @@
 
 #include "worker.h"
 
-#if defined _WIN32
-#include <process.h>
-#define getpid _getpid
-#else
-#include <unistd.h>
-#endif
-
-int64_t number_of_process(void) {
-    return (int64_t)getpid();
-}
-
 /* Ends this process if an FMU has forked it and returned in it as well. */
 static void end_twin(const Worker *w) {
     if (w->process != number_of_process()) {

@@ -47,8 +47,6 @@ typedef struct {
     int64_t first_memory; /* bytes of the process after the first resets; 0 before */
 } Worker;
 
-int64_t number_of_process(void);
-
 /* Answers requests until one is to close, or the other end is gone. */
 void worker_serve(Worker *worker);
 

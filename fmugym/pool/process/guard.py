@@ -178,7 +178,7 @@ class _Guard:
                 os.dup2(descriptor, stream)
                 os.close(descriptor)
             os.setpgid(0, 0)  # not a session: Linux schedules each by itself
-            _enter(order["directory"], order["folder"])
+            os.chdir(order["directory"])
             if self._native.end_with(guard):
                 if order["command"]:
                     _become_program(order, channel)
@@ -268,14 +268,6 @@ def _received(lifeline: socket.socket) -> Any:
     (size,) = SIZE.unpack(head)
     data = lifeline.recv(size, socket.MSG_WAITALL)
     return marshal.loads(data) if len(data) == size else None
-
-
-def _enter(directory: str, folder: str) -> None:
-    """Make a directory the working directory, or a folder if the directory has been removed."""
-    try:
-        os.chdir(directory)
-    except OSError:
-        os.chdir(folder)
 
 
 def _become_program(order: Any, channel: int) -> NoReturn:

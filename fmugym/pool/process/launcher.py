@@ -33,7 +33,7 @@ class Order:
 
     Attributes:
         folder: Where the FMU was extracted to. It is removed if this process is killed.
-        directory: The working directory; the folder if it has been removed.
+        directory: The working directory.
         environment: The environment variables.
         command: A program and its arguments; empty for a worker in a bare interpreter.
         checks_heap: See ``ProcessPool``.
@@ -52,10 +52,18 @@ class Order:
             "directory": self.directory,
             "environment": dict(self.environment),
             "command": list(self.command),
-            "path": [str(place) for place in sys.path],  # for FMUs that run Python
+            "path": _import_path(),
         }
         data = marshal.dumps(parts)
         return guard.SIZE.pack(len(data)) + data
+
+
+def _import_path() -> list[str]:
+    """Where FMUs that run Python look for modules, from any working directory."""
+    try:
+        return [os.path.abspath(place) for place in sys.path]
+    except ordinary(OSError):  # the working directory has been removed
+        return [place for place in sys.path if os.path.isabs(place)]
 
 
 class Process(Protocol):
@@ -270,7 +278,7 @@ class _LoneProcess:
             _command(len(share(os.getpid()))),
             stdin=subprocess.PIPE,
             env=dict(order.environment),
-            cwd=order.directory if os.path.isdir(order.directory) else str(order.folder),
+            cwd=order.directory,
         )
         self._process, self.pid = process, process.pid
         assert process.stdin is not None

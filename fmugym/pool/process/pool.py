@@ -7,6 +7,7 @@ status ``FATAL`` and the cause, until the next reset makes them anew. Those of o
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import math
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.fmu import FMU
+from fmugym.archive.fmu import FMU, extracted_again
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
@@ -107,7 +108,7 @@ class ProcessPool(AskingPool):
             self.workers = min(num_instances, workers or available_processors())
             threads = threads or max(1, available_processors() // self.workers)
             setup = Setup.of(fmu, spec, num_instances, log, threads=threads, **options)
-            setups = _share_out(setup, self.workers)
+            self._setup, setups = setup, _share_out(setup, self.workers)
             memories = _make_memories(spec, setups)
         except BaseException:
             fmu.close()
@@ -127,9 +128,9 @@ class ProcessPool(AskingPool):
 
     # The contract of Pool.
 
-    def _reset_some(
+    def _reset_once(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
-    ) -> None:
+    ) -> int:
         """Reset blocks; if a worker dies in it, a new one tries again; if it is killed, another."""
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
@@ -141,6 +142,11 @@ class ProcessPool(AskingPool):
             while concerned:
                 concerned = self._reset(concerned, variables, values, mask)
             self._group.note_lost()
+            return int(np.count_nonzero(self.statuses[mask] > WARNING_CODE))
+
+    def extract(self) -> bool:
+        """See ``Pool.extract``."""
+        return extracted_again(self._setup.fmu, len(self._setup.copies) and self.num_instances)
 
     def _reset(
         self,
@@ -153,7 +159,7 @@ class ProcessPool(AskingPool):
 
         Either it was used before, or it was killed from outside.
         """
-        listing = request_listing(variables, self._version)
+        listing, texts = request_listing(variables, self._version), _texts_of(variables)
         used = {s for s in supervisors if not s.is_new}
         kills = {s: s.kills for s in supervisors}
         alive = self._group.revive(supervisors)
@@ -162,6 +168,7 @@ class ProcessPool(AskingPool):
             block, writer = supervisor.block, Writer().block(listing)
             writer.array(values[:, block], np.float64).array(mask[block], np.bool_)
             supervisor.forget_output()
+            supervisor.lend(texts)
             supervisor.tell(Request.RESET, writer.form(), supervisor.read_growth)
 
         for supervisor in self._group.run(RESET, alive, tell):
@@ -385,6 +392,12 @@ class ProcessPool(AskingPool):
         missing = np.flatnonzero(lost if mask is None else lost & mask)
         if missing.size:
             raise SimulationError(self.failure(int(missing[0])))
+
+
+@functools.lru_cache(maxsize=64)
+def _texts_of(variables: tuple[Variable, ...]) -> tuple[str, ...]:
+    """The texts that Strings may get, which may be paths."""
+    return tuple(text for v in variables if v.kind == "string" for text, _ in v.items)
 
 
 def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:

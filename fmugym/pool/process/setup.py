@@ -6,7 +6,7 @@ import itertools
 import logging
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +20,7 @@ from fmugym.pool.process.launcher import Order
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory
 from fmugym.pool.saving_pool import keeps_records
 from fmugym.pool.spec import ResetMethod
-from fmugym.signals import ordinary
+from fmugym.signals import Ignoring, ordinary
 from fmugym.wine.installation import windows_path
 from fmugym.wine.prefix import Wine
 
@@ -29,8 +29,8 @@ __all__ = ["Setup"]
 _seeds: Final = itertools.count(1)
 """Of the random numbers of the C library, each for a worker on trial."""
 
-_COPIES: Final = "copies-for-workers"
-"""The folder within the FMU's one that has the copies."""
+_WORKERS: Final = "of-workers"
+"""The folder within the FMU's one that has a folder for each worker."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +40,21 @@ class Setup:
     Attributes:
         fmu: The FMU.
         folder: Where it was extracted to.
+        files: Where the worker has its files: the folder, or its own copy of it.
+        scratch: The worker's working directory.
         copies: Of its libraries, for each of the N instances; empty if they share them.
         before: The libraries to load before its own; see ``FMU.libraries_before``.
         spec: What to do at each reset and step.
         num_instances: N, the instances of all workers together.
         logs_all: Whether FMUs are asked to log everything.
-        directory: The working directory; empty if it has been removed.
+        directory: The working directory of this process; empty if it has been removed.
         environment: The environment variables.
+        texts: The start values of the FMU's Strings, which may be paths.
         block: The indices of the worker's instances.
         number: Which of the pool's workers it is.
         threads: See ``NativePool``.
-        own_files: Whether the worker has a copy of the folder, which is also its working
-            directory, because instances would share files otherwise.
+        own_files: Whether the worker has a copy of the folder, because instances would share files
+            otherwise.
         checks_heap: Whether the C library ends workers that free memory beyond which an FMU has
             written; only with glibc.
         on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
@@ -61,6 +64,8 @@ class Setup:
 
     fmu: FMU
     folder: Path
+    files: Path
+    scratch: Path
     copies: tuple[Path, ...]
     before: tuple[tuple[str, str], ...]
     spec: PoolSpec
@@ -68,6 +73,7 @@ class Setup:
     logs_all: bool
     directory: str
     environment: Mapping[str, str]
+    texts: tuple[str, ...]
     block: slice
     number: int = 0
     threads: int = 1
@@ -101,6 +107,8 @@ class Setup:
         return cls(
             fmu=fmu,
             folder=folder,
+            files=folder,
+            scratch=folder,
             copies=tuple(copy_libraries(fmu, num_instances)) if private_libraries else (),
             before=_libraries_before(fmu, folder),
             spec=spec.fitting(fmu.description),
@@ -108,6 +116,7 @@ class Setup:
             logs_all=log.isEnabledFor(logging.INFO),
             directory=_working_directory(),
             environment=dict(os.environ),
+            texts=tuple(_start_texts(fmu)),
             block=slice(num_instances),
             wine=Wine.ready() if fmu.in_wine else None,
             **options,
@@ -128,36 +137,59 @@ class Setup:
         """Whether the worker needs its own copy of the folder: an FMU may keep state in files."""
         return self.own_files or self.spec.reset_method is ResetMethod.PROCESS
 
-    def with_copy(self) -> Setup:
-        """Copy the folder afresh, in the place of the copy of an earlier worker.
+    def prepared(self) -> Setup:
+        """Make the files that a new process needs, in the place of those of an earlier one.
+
+        They are an empty working directory, the files of the FMU that are missing, and its own copy
+        of them if it needs one.
 
         Raises:
             FMULoadError: If the system refuses.
         """
-        folder = self.folder / _COPIES / str(self.number)
+        own = self.fmu.extract() / _WORKERS / str(self.number)
         try:
-            shutil.rmtree(folder, ignore_errors=True)
-            shutil.copytree(self.folder, folder, ignore=shutil.ignore_patterns(_COPIES))
+            shutil.rmtree(own, ignore_errors=True)
+            scratch = own / "scratch"
+            scratch.mkdir(parents=True)
+            if not self.needs_copy:
+                if self.copies:
+                    copy_libraries(self.fmu, self.num_instances)
+                return replace(self, scratch=scratch)
+            files, left_out = own / "files", shutil.ignore_patterns(_WORKERS)
+            shutil.copytree(self.folder, files, ignore=left_out)
         except ordinary(OSError, shutil.Error) as error:
             raise FMULoadError(
-                f"{self.fmu.path.name} needs a copy of its files for each process: {error}"
+                f"{self.fmu.path.name} needs a folder for each process: {error}"
             ) from None
-        directory = str(folder) if self.own_files else self.directory
-        return replace(
-            self,
-            folder=folder,
-            copies=(),  # the process has one instance
-            before=_libraries_before(self.fmu, folder),
-            directory=directory,
-        )
+        before = _libraries_before(self.fmu, files)
+        # Of libraries there are no copies, because the process has one instance.
+        return replace(self, files=files, scratch=scratch, copies=(), before=before)
+
+    def lend(self, texts: Iterable[str]) -> None:
+        """Let the worker find the user's files that its FMU is told of by relative paths.
+
+        A link to each appears in the worker's own working directory.
+
+        Args:
+            texts: The texts that the FMU may get; those that name no file change nothing.
+        """
+        scratch = self.folder / _WORKERS / str(self.number) / "scratch"
+        for text in texts if self.directory else ():
+            with Ignoring(OSError, ValueError):  # it is no path
+                own = Path(self.directory, text)
+                first = Path(text).parts[:1]
+                if own.exists() and not os.path.isabs(text) and first != ("..",):
+                    Path(scratch, *first).symlink_to(Path(self.directory, *first))
 
     def order(self) -> Order:
         """What to start."""
-        directory = self.directory or str(self.folder)
         if self.wine is None:
-            return Order(self.folder, directory, self.environment, checks_heap=self.checks_heap)
-        environment = self.wine.environment(self.environment)
-        return Order(self.folder, directory, environment, self.wine.command)
+            environment, command = self.environment, []
+        else:
+            environment, command = self.wine.environment(self.environment), self.wine.command
+        return Order(
+            self.folder, str(self.scratch), environment, command, checks_heap=self.checks_heap
+        )
 
     def opening(self, memory: Memory) -> bytes:
         """The first request: what to load, how to step it, and where the shared memory is."""
@@ -182,7 +214,7 @@ class Setup:
 
     def _files(self) -> Files:
         """Where the worker finds the FMU, or the copies of libraries for its own instances."""
-        fmu, folder = self.fmu, self.folder
+        fmu, folder = self.fmu, self.files
         if fmu.in_wine:
             return Files.in_wine(fmu, folder)
         if not self.copies:
@@ -202,6 +234,16 @@ class Setup:
 
 def _libraries_before(fmu: FMU, folder: Path) -> tuple[tuple[str, str], ...]:
     return () if fmu.in_wine else tuple(fmu.libraries_before(folder))
+
+
+def _start_texts(fmu: FMU) -> Iterator[str]:
+    """The texts that Strings of an FMU, or of a system's components, have at first."""
+    for variable in fmu.description.variables.values():
+        if variable.kind == "string" and variable.start:
+            yield variable.start
+    plan = getattr(fmu, "plan", None)
+    for component in () if plan is None else plan.components:
+        yield from (value for _, value in component.starts if isinstance(value, str))
 
 
 def _working_directory() -> str:

@@ -10,7 +10,7 @@ import signal
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
@@ -195,7 +195,8 @@ class Supervisor:
         self._opening = True
         try:
             with _refusals():
-                setup = self._setup.with_copy() if self._setup.needs_copy else self._setup
+                setup = self._setup.prepared()
+                setup.lend(setup.texts)
                 self._content = setup.opening(self._memory)
                 self._process, self._channel = self._launch(setup)
         except LostError:
@@ -389,6 +390,10 @@ class Supervisor:
         """Note the steps of the episodes before a rollout, shape of the block."""
         self._progress[:] = steps
         self._done = self._progress.tobytes()
+
+    def lend(self, texts: Sequence[str]) -> None:
+        """See ``Setup.lend``."""
+        self._setup.lend(texts)
 
     def forget_output(self) -> None:
         """Forget what was printed, because it would not explain a later failure."""
