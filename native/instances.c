@@ -1,5 +1,6 @@
 #include "instances.h"
 
+#include "copies.h"
 #include "failures.h"
 #include "floats.h"
 #include "loading.h"
@@ -166,12 +167,42 @@ static void reload_private_library(Pool *pool, Instance *me) {
     char unused[256];
 
     if (s->private_libraries) {
+        copy_leave(pool, me);
         pool_unload(pool, index_of(pool, me));
         if (!pool_load(pool, index_of(pool, me), unused, sizeof unused)) {
             pool_unload(pool, index_of(pool, me));
         }
     }
     floats_restore(&pool->floats); /* loading a library runs code, too */
+}
+
+/* Some FMUs refuse an instance after hundreds, because they run out of something that is never given
+ * back. */
+static bool build_with_copy(Pool *pool, Instance *me) {
+    bool is_new = false;
+
+    while (!is_new && !atomic_get(&pool->copies_in_vain) && copy_take(pool, me, &is_new)) {
+        if (instance_build(pool, me)) {
+            if (is_new && atomic_add(&pool->copies_used, 1) == 0) {
+                log_tell(&pool->log, index_of(pool, me),
+                         "the FMU refused a further instance; a fresh copy of its library makes it");
+            }
+            return true;
+        }
+    }
+    if (is_new) {
+        atomic_set(&pool->copies_in_vain, 1);
+        copy_leave(pool, me);
+    }
+    return false;
+}
+
+static bool build_again(Pool *pool, Instance *me) {
+    if (instance_build(pool, me)) {
+        atomic_set(&pool->copies_in_vain, 0);
+        return true;
+    }
+    return build_with_copy(pool, me);
 }
 
 static Status rebuild(Pool *pool, Instance *me) {
@@ -182,7 +213,7 @@ static Status rebuild(Pool *pool, Instance *me) {
         reload_private_library(pool, me);
     }
     const bool loaded = me->library->functions != NULL;
-    if (loaded && instance_build(pool, me)) {
+    if (loaded && build_again(pool, me)) {
         return STATUS_OK;
     }
     Failure *failure = failure_note(me,

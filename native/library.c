@@ -109,6 +109,22 @@ static Function find(void *handle, const char *name) {
     return (Function)GetProcAddress((HMODULE)handle, name);
 }
 
+bool library_copy(const char *from, const char *to) {
+    wchar_t source[4096], target[4096];
+
+    return MultiByteToWideChar(CP_UTF8, 0, from, -1, source, 4096) != 0 &&
+           MultiByteToWideChar(CP_UTF8, 0, to, -1, target, 4096) != 0 &&
+           CopyFileW(source, target, FALSE);
+}
+
+void library_remove(const char *path) {
+    wchar_t wide[4096];
+
+    if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) != 0) {
+        DeleteFileW(wide);
+    }
+}
+
 #else
 
 /* Returns a descriptor of the old working directory; -1 if nothing was changed. */
@@ -159,6 +175,35 @@ static Function find(void *handle, const char *name) {
     Function function = NULL;
     memcpy(&function, &symbol, sizeof function);
     return function;
+}
+
+static bool copy_bytes(FILE *source, FILE *target) {
+    char bytes[1 << 16];
+    size_t count;
+
+    while ((count = fread(bytes, 1, sizeof bytes, source)) > 0) {
+        if (fwrite(bytes, 1, count, target) < count) {
+            return false;
+        }
+    }
+    return ferror(source) == 0;
+}
+
+bool library_copy(const char *from, const char *to) {
+    FILE *source = fopen(from, "rbe"), *target = source == NULL ? NULL : fopen(to, "wbe");
+    bool copied = target != NULL && copy_bytes(source, target);
+
+    if (target != NULL) {
+        copied &= fclose(target) == 0;
+    }
+    if (source != NULL) {
+        fclose(source);
+    }
+    return copied;
+}
+
+void library_remove(const char *path) {
+    unlink(path);
 }
 
 #endif

@@ -22,6 +22,10 @@ void *library_load(const char *path, char *error, size_t size);
 bool library_open(Library *library, const char *path, char *error, size_t size);
 void library_close(Library *library);
 
+/* Copies the file of a library, and removes a copy. Returns whether it was copied. */
+bool library_copy(const char *from, const char *to);
+void library_remove(const char *path);
+
 /* A function of the library and its place in the table of functions. */
 typedef struct {
     const char *name; /* without the prefix */

@@ -6,10 +6,9 @@ size_t parts_of(const Settings *settings) {
     return settings->system == NULL ? 1 : settings->system->count;
 }
 
-bool pool_load(Pool *pool, size_t index, char *error, size_t size) {
+bool pool_load_from(Pool *pool, Library *library, const char *const *paths, char *error,
+                    size_t size) {
     const Settings *s = &pool->settings;
-    const char *const *paths = s->paths + index * parts_of(s);
-    Library *library = &pool->libraries[index];
 
     library->identifier = s->model;
     if (s->system != NULL) {
@@ -18,10 +17,20 @@ bool pool_load(Pool *pool, size_t index, char *error, size_t size) {
     return library_open(library, *paths, error, size) && s->fmi->bind(library, error, size);
 }
 
-void pool_unload(Pool *pool, size_t index) {
+void pool_unload_from(Pool *pool, Library *library) {
     if (pool->settings.system != NULL) {
-        system_unload(&pool->libraries[index]);
+        system_unload(library);
     } else {
-        library_close(&pool->libraries[index]);
+        library_close(library);
     }
+}
+
+bool pool_load(Pool *pool, size_t index, char *error, size_t size) {
+    const Settings *s = &pool->settings;
+    return pool_load_from(pool, &pool->libraries[index], s->paths + index * parts_of(s), error,
+                          size);
+}
+
+void pool_unload(Pool *pool, size_t index) {
+    pool_unload_from(pool, &pool->libraries[index]);
 }

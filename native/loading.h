@@ -12,5 +12,9 @@ size_t parts_of(const Settings *settings);
  * error says why, and the caller must still unload it. */
 bool pool_load(Pool *pool, size_t index, char *error, size_t size);
 void pool_unload(Pool *pool, size_t index);
+/* The same for any library of the pool's FMU, from other files. */
+bool pool_load_from(Pool *pool, Library *library, const char *const *paths, char *error,
+                    size_t size);
+void pool_unload_from(Pool *pool, Library *library);
 
 #endif

@@ -254,6 +254,12 @@ static void deliver(uint64_t environment, int status, const char *category, char
     mutex_unlock(&lock);
 }
 
+void log_tell(Log *log, size_t index, const char *text) {
+    mutex_lock(&lock);
+    queue_message(log, index * log->parts, 1, "fmugym", text);
+    mutex_unlock(&lock);
+}
+
 /* Recent messages */
 
 static size_t size_of(const Recent *recent) {

@@ -72,6 +72,8 @@ void log_give_back(Log *log, Message *first, size_t dropped);
 /* Stands before such messages at the end of an error. */
 #define LOG_SAID "\x1d"
 char *log_said(Log *log, size_t index);
+/* Queues a message of this package about an instance. */
+void log_tell(Log *log, size_t index, const char *text);
 /* Whether an instance has logged nothing since it was made or its messages were forgotten. */
 bool log_is_silent(const Log *log, size_t index);
 void log_forget(Log *log, size_t index);

@@ -149,6 +149,8 @@ typedef struct {
 /* The episodes of all instances so far; see records.h. */
 typedef struct Records Records;
 
+typedef struct LibraryCopy LibraryCopy;
+
 enum { SAMPLES = 8 };
 
 /* The measured cost of an operation: a low quantile of the last samples. Other load on the
@@ -190,6 +192,10 @@ typedef struct Pool {
     Atomic states_too_large;
     Atomic no_categories; /* whether the FMU is asked no more to log why calls fail */
     Atomic heard;         /* how often an instance was asked to log everything */
+    LibraryCopy *copies; /* the latest one first; see copies.h */
+    unsigned copies_made;
+    Atomic copies_used;    /* how many of them have made an instance */
+    Atomic copies_in_vain; /* whether the FMU refused an instance of a new copy, too */
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

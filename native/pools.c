@@ -6,6 +6,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "copies.h"
 #include "failures.h"
 #include "inside.h"
 #include "loading.h"
@@ -149,6 +150,7 @@ static void free_instances(Pool *pool) {
         instance_discard(pool, &pool->instances[i]);
         failure_drop(&pool->instances[i]);
     }
+    copies_close(pool);
     for (size_t i = 0; i < number_of_libraries(s) && pool->libraries != NULL; i++) {
         pool_unload(pool, i);
     }

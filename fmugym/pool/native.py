@@ -122,9 +122,9 @@ class NativePool(AskingPool):
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self._watched(self._pool.reset)
-        self._starting_play = tuple(
-            self._with_files(self._watched(function))
-            for function in (self._pool.play, self._pool.reset_by)
+        self._starting_play = (
+            self._with_files(self._watched(self._pool.play)),
+            self._with_files(self._watched(self._pool.reset_by)),
         )
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:

@@ -16,7 +16,14 @@ from fmugym.fmi.words import quoted, unpacked
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.system_description import SystemDescription
 
-__all__ = ["Failure", "Receiver", "as_log_record", "describe_failure", "loading_failed"]
+__all__ = [
+    "REFUSED_ANEW",
+    "Failure",
+    "Receiver",
+    "as_log_record",
+    "describe_failure",
+    "loading_failed",
+]
 
 _LEVELS: Final = (
     logging.INFO,
@@ -27,6 +34,9 @@ _LEVELS: Final = (
 )
 _NO_REFERENCE: Final = 2**32 - 1
 _DERIVATIVES: Final = "the derivative by", "the derivative of"
+REFUSED_ANEW: Final = "the FMU refused to be instantiated anew"
+"""How a failure of an instance begins that could not be made again; see ``native/instances.c``."""
+
 _SAID: Final = "\x1d"
 """Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 

@@ -3,7 +3,7 @@
    The models: zoo.c and faulty.c do wrong what their parameters say, mortal.c what its token says;
    quirks.c is useful but breaks one promise;
    demanding.c wants a licence or time; words.c says why it fails;
-   resource.c and files.c read and write files; scratch.c works in data that instances share.
+   resource.c and files.c read and write files; limited.c makes some instances only; scratch.c works in data that instances share.
    usual.c does what a model leaves out, and what several do. */
 
 #include <stdbool.h>

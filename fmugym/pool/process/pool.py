@@ -25,7 +25,7 @@ from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.fmi.status import WARNING_CODE
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.asking import AskingPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
@@ -39,11 +39,13 @@ from fmugym.pool.base import (
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.form import Writer
 from fmugym.pool.health import HealthArray, new_arrays
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, ROLLOUT, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
+from fmugym.pool.reports import REFUSED_ANEW
 from fmugym.pool.requests import Answer, Reader, Request, request_listing
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
@@ -100,7 +102,8 @@ class ProcessPool(AskingPool):
         make_group: Callable[..., WorkerGroup] = WorkerGroup,
         **options: bool,
     ) -> None:
-        self._spec = spec
+        self._spec, self._log = spec, log
+        self._has_told = False
         self._lock = RLock()
         self._play: PlayOfWorkers | None
         try:
@@ -157,7 +160,7 @@ class ProcessPool(AskingPool):
     ) -> list[Supervisor]:
         """Reset blocks; returns those that lost a worker in whose place a new one may succeed.
 
-        Either it was used before, or it was killed from outside.
+        It was used before, or it was killed from outside, or its FMU made no further instance.
         """
         listing, texts = request_listing(variables, self._version), _texts_of(variables)
         used = {s for s in supervisors if not s.is_new}
@@ -175,7 +178,31 @@ class ProcessPool(AskingPool):
             supervisor.note_success()
             block = supervisor.block
             self._group.lost[block] &= ~mask[block]
-        return [s for s in supervisors if (s in used and s.is_new) or s.kills > kills[s]]
+        played = [s for s in alive if s in used and not s.is_new]
+        exhausted = [s for s in played if self._is_exhausted(s, mask)]
+        for supervisor in exhausted:
+            self._replace_exhausted(supervisor)
+        return exhausted + [
+            s for s in supervisors if (s in used and s.is_new) or s.kills > kills[s]
+        ]
+
+    def _is_exhausted(self, supervisor: Supervisor, mask: MaskArray) -> bool:
+        """Whether the FMU makes no further instance in the process of a worker.
+
+        It may have run out of something that is given back only with the process. A licence that
+        it does not get is no reason: the other instances would lose theirs.
+        """
+        block = supervisor.block
+        dead = mask[block] & (self.statuses[block] == Status.FATAL) & ~self._group.lost[block]
+        texts = [self.failure(block.start + int(index)) for index in np.flatnonzero(dead)]
+        return any(REFUSED_ANEW in text and not speaks_of_licence(text) for text in texts)
+
+    def _replace_exhausted(self, supervisor: Supervisor) -> None:
+        reason = f"worker process {supervisor.pid} was replaced: its FMU made no further instance"
+        self._group.retire(supervisor, reason)
+        if not self._has_told:
+            self._has_told = True
+            self._log.warning("%s: %s", self._setup.fmu.path.name, reason)
 
     def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
         """End the workers that have played an episode, so that each episode has a new process."""

@@ -315,6 +315,7 @@ class Supervisor:
         with self._ending_if_interrupted():
             self.begin_closing()
             self.close(deadline)
+        self.is_new = True  # the next one will be
         self._deaths, self.reason = deaths, printable(f"{self._name}: {reason}")
 
     def note_success(self) -> None:
