@@ -97,6 +97,7 @@ def conversion_between(
     """
     if wanted is None or own is None or wanted == own:
         return IDENTITY
+    own, wanted = _meant(own, definitions), _meant(wanted, definitions)
     displays = definitions.get(own, Unit()).display_units
     if wanted in displays:
         return Conversion(*displays[wanted])
@@ -141,6 +142,7 @@ def conversion_of_link(
     """
     if source is None or target is None:
         return IDENTITY
+    source, target = _meant(source, source_units), _meant(target, target_units)
     for dimension, (factor, offset) in _defined(source, source_units):
         for other, (to_base, base_offset) in _defined(target, target_units):
             if dimension is not None and dimension == other:
@@ -148,6 +150,15 @@ def conversion_of_link(
     if source == target:
         return IDENTITY
     return _conversion_by_pint(source, source_units, target, target_units)
+
+
+def _meant(name: str, definitions: Mapping[str, Unit]) -> str:
+    """The name of a unit without brackets, which some tools write: ``[m]``, and ``[-]`` for 1."""
+    brackets = re.fullmatch(r"\[([^][]*)\]", name.strip())
+    if brackets is None or any(True for _ in _defined(name, definitions)):
+        return name
+    inside = brackets[1].strip()
+    return "1" if inside in {"", "-"} else inside
 
 
 _LARGE: Final = 2.0**20

@@ -86,16 +86,38 @@ class Proposal:
         if not self._actions:
             raise ConfigError(
                 f"{fmu.path.name} has no numeric input or tunable parameter that an agent could "
-                "act on"
+                f"act on{self._why_none()}"
             )
 
     @cached_property
     def _actions(self) -> list[Variable]:
-        """The inputs that an agent may act on, or a tunable parameter if there are none."""
+        """The inputs that an agent may act on, or tunable parameters if there are none.
+
+        Of a system, these are the parameters that are connectors of its own, if there are any.
+        """
         variables = self._fmu.description.variables.values()
         tunable = [v for v in variables if v.numeric and v.settable_in_step]
+        own = [variable for variable in tunable if variable.name in self._connectors]
         inputs = self._skeleton.inputs
-        return [v for v in inputs if not _is_outside(v)] or inputs or tunable[:1]
+        return [v for v in inputs if not _is_outside(v)] or inputs or own or tunable[:1]
+
+    @cached_property
+    def _connectors(self) -> set[str]:
+        """The names of a system's own connectors; an FMU has none."""
+        description = self._fmu.description
+        if not isinstance(description, SystemDescription):
+            return set()
+        return {one.name for one in description.plan.connectors}
+
+    def _why_none(self) -> str:
+        """What a user can do where nothing can be acted on."""
+        fixed = [v.name for v in self._skeleton.parameters if v.numeric]
+        if not isinstance(self._fmu.description, SystemDescription):
+            return ""
+        cure = "; give the system a connector of the kind 'input'"
+        if not fixed:
+            return cure
+        return f"{cure}. Its parameters, such as {fixed[0]!r}, are fixed within an episode"
 
     @cached_property
     def _others(self) -> list[Variable]:
@@ -129,7 +151,8 @@ class Proposal:
             yield f"input {variable.name!r} looks like a disturbance: no action writes it"
         for variable in filter(needs_bounds, self._actions):
             yield (
-                f"the FMU gives no limits of input {variable.name!r}: those in the file are a guess"
+                f"the FMU gives no limits of {variable.causality} {variable.name!r}: those in the "
+                "file are a guess"
             )
         used = {*map(_scalar_or_array, [*self._actions, *self._skeleton.outputs])}
         for name in used & self._guessed.keys():

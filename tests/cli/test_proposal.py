@@ -1,8 +1,10 @@
 """The tasks that ``fmugym new`` proposes: what they guess, and that they can be learned."""
 
 import json
+import zipfile
 
 import pytest
+import ssp_tools
 import test_cli
 from fmu_tools import probe_fmu
 from makers import MADE
@@ -10,6 +12,7 @@ from test_cli import INPUT, OUTPUT, variable
 
 import fmugym
 from fmugym.archive.bundled import MODELS
+from fmugym.tools.proposal import Proposal
 
 make_fmu = test_cli.make_fmu
 
@@ -125,3 +128,54 @@ def test_guesses_are_marked_in_the_file(ran):
     out = ran("new", fmugym.bundled_fmu("House"))
     marked = [line for line in out.splitlines() if "TODO: a guess" in line]
     assert [line.split(" =")[0] for line in marked] == ["reward", "T_air_set"]
+
+
+class TestArchives:
+    """Archives without inputs: all that an agent might act on is driven within."""
+
+    def archive(self, folder, fmu, ports, crossing, more=(), own=()):
+        """Two components that drive each other; outputs by the inputs that they drive."""
+        pairs = [("a", "b"), ("b", "a")]
+        wires = [
+            ssp_tools.connection(f"{x}.{out}", f"{y}.{into}", suppressUnitConversion="true")
+            for x, y in pairs
+            for into, out in crossing.items()
+        ]
+        parts = [ssp_tools.component(name, ports, f"resources/{fmu}.fmu") for name in "ab"]
+        root = ssp_tools.system("s", dict(own), parts, [*wires, *more])
+        path = folder / "closed.ssp"
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("SystemStructure.ssd", ssp_tools.HEAD + root + ssp_tools.TAIL)
+            file.write(fmugym.bundled_fmu(fmu), f"resources/{fmu}.fmu")
+        return path
+
+    def house(self, folder, **options):
+        crossing = {"T_out": "T_m", "u": "COP", "Q_int": "P", "I_sol": "E"}
+        inputs = dict.fromkeys(crossing, "input") | dict.fromkeys(crossing.values(), "output")
+        return self.archive(folder, "House", inputs | {"H_ve": "parameter"}, crossing, **options)
+
+    def test_a_tunable_parameter_is_the_action(self, tmp_path, new):
+        task, notes = new(self.house(tmp_path))
+        (action,) = task["agent"]["actions"]
+        assert task["variables"][action]["name"] == "a.H_ve"
+        assert "parameter 'a.H_ve'" in notes
+        self.plays(task)
+
+    def test_parameters_of_the_system_come_first(self, tmp_path, new):
+        more = [ssp_tools.connection(name, f"{name[-1]}.H_ve") for name in ("H_a", "H_b")]
+        own = {"H_a": "parameter W/K", "H_b": "parameter W/K"}
+        task, _ = new(self.house(tmp_path, more=more, own=own))
+        assert task["agent"]["actions"] == ["H_a", "H_b"]
+        self.plays(task)
+
+    def plays(self, task):
+        with fmugym.load(task) as env:
+            env.reset(seed=0)
+            assert not env.step(env.action_space.low)[4].get("fault")
+
+    def test_fixed_parameters_are_refused_with_a_reason(self, tmp_path, ran):
+        ports = {"f": "input", "x": "output"}
+        path = self.archive(tmp_path, "CartPole", ports, {"f": "x"})
+        with pytest.raises(fmugym.ConfigError) as error:
+            Proposal(fmugym.FMUSystem.read(path).as_fmu())
+        assert all(word in str(error.value) for word in ("closed.ssp", "'input'", "a.m_cart"))

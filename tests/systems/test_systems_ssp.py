@@ -328,6 +328,65 @@ def traced_by_fmpy(ssd):
     return found
 
 
+class TestDrafts:
+    """Archives of the drafts of 2015, in which a connector has a causality and no kind."""
+
+    @pytest.mark.parametrize("root", [NESTED, one_house(("q", "h.Q_int"), ports={"q": "input W"})])
+    def test_are_read_as_version_1(self, pack, root):
+        new = FMUSystem.read(pack(root))
+        assert " kind=" in root
+        old = FMUSystem.read(pack(root.replace(" kind=", " causality=")))
+        assert old.connectors == new.connectors
+        assert old.connectors
+        assert old.plan.links == new.plan.links
+
+    def test_an_agent_acts_on_a_system(self, pack):
+        root = one_house(("u", "h.u"), ("h.T_op", "T"), ports={"u": "input 1", "T": "output degC"})
+        task = {
+            "time_step": "15min",
+            "agent": {"actions": ["u"], "observations": ["T"]},
+            "variables": {"u": {"min": 0, "max": 1}},
+            "reward": "-abs(T - 21)",
+        }
+        seen = []
+        for text in (root, root.replace(" kind=", " causality=")):
+            with fmugym.load(task | {"fmu": str(pack(text))}) as env:
+                env.reset(seed=0)
+                seen.append([env.step([1.0])[:2] for _ in range(3)])
+        assert seen[0] == seen[1]
+        assert 15 < seen[0][-1][0] < 40
+
+    @pytest.mark.parametrize(("unit", "known"), [("[degC]", "degC"), ("[ K ]", "K")])
+    def test_units_in_brackets_are_those_within(self, pack, unit, known):
+        def read(unit):
+            root = one_house(("T", "h.T_out"), ports={"T": f"input {unit}"})
+            return FMUSystem.read(pack(root)).connectors[0]
+
+        assert read(unit).unit == unit
+        (one,), (other,) = read(unit).ends, read(known).ends
+        assert (one.gain, one.offset) == (other.gain, other.offset)
+
+    @pytest.mark.parametrize("unit", ["[-]", "[]"])
+    def test_nothing_in_brackets_is_no_dimension(self, pack, unit):
+        root = one_house(("q", "h.u"), ports={"q": f"input {unit}"})
+        (end,) = FMUSystem.read(pack(root)).connectors[0].ends
+        assert (end.gain, end.offset) == (1.0, 0.0)
+
+    @pytest.mark.parametrize("unit", ["[m]", "[widget]"])
+    def test_units_in_brackets_of_something_else_are_refused(self, pack, unit):
+        root = one_house(("T", "h.T_out"), ports={"T": f"input {unit}"})
+        with pytest.raises(ConfigError) as error:
+            FMUSystem.read(pack(root))
+        assert unit[1:-1] in str(error.value)
+
+    def test_a_definition_of_the_file_comes_first(self, pack):
+        own = '<ssd:Unit name="[m]"><ssc:BaseUnit K="1" factor="2"/></ssd:Unit>'
+        units = f"<ssd:Units>{own}</ssd:Units>"
+        root = one_house(("T", "h.T_out"), ports={"T": "input [m]"})
+        (end,) = FMUSystem.read(pack(root, units)).connectors[0].ends
+        assert end.gain == 2.0
+
+
 class TestMistakes:
     @pytest.mark.parametrize(
         ("root", "error", "facts"),

@@ -245,7 +245,8 @@ def _read_connectors(xml: Any) -> dict[str, OwnConnector]:
         found_types = (next(children(one, name), None) for name in _REALS)
         real = next((element for element in found_types if element is not None), None)
         unit = None if real is None else unit_of(real)
-        found[one.get("name") or ""] = OwnConnector(one.get("kind") or "", unit)
+        kind = one.get("kind") or one.get("causality")  # as drafts of 2015 call it
+        found[one.get("name") or ""] = OwnConnector(kind or "", unit or unit_of(one))
     return found
 
 

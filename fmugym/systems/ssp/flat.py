@@ -215,6 +215,8 @@ class Flat:
         conversion = IDENTITY
         if convert and value.unit is not None and unit is not None:
             conversion = conversion_of_link(value.unit, value.units, unit, self._units_at(node))
+            variable = self._variable(node)
+            conversion = conversion.of_differences(variable is not None and variable.relative)
         known = (value.unit, value.units) if unit is None else (unit, self._units_at(node))
         return _Value(scaling.after(conversion.after(value.change)), *known)
 
