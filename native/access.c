@@ -267,11 +267,13 @@ static uint64_t to_uint64(double value) {
     return value >= 18446744073709551616.0 ? UINT64_MAX : (uint64_t)value;
 }
 
-#define LOAD(type)                                                                                 \
+#define LOAD_AS(type, convert)                                                                     \
     for (size_t i = 0; i < part->count; i++) {                                                     \
-        values[part->positions[i]] = (double)((const type *)typed)[part->places[i]];               \
+        const double value = (double)((const type *)typed)[part->places[i]];                       \
+        values[part->positions[i]] = (convert);                                                    \
     }                                                                                              \
     break
+#define LOAD(type) LOAD_AS(type, value)
 
 static void load(const Part *part, Type type, const void *typed, double *values) {
     switch (type) {
@@ -285,6 +287,9 @@ static void load(const Part *part, Type type, const void *typed, double *values)
     case TYPE_UINT16: LOAD(uint16_t);
     case TYPE_UINT32: LOAD(uint32_t);
     case TYPE_UINT64: LOAD(uint64_t);
+    case TYPE_NEGATED_FLOAT64: LOAD_AS(double, 0.0 - value); /* never -0.0 */
+    case TYPE_NEGATED_INT32: LOAD_AS(int32_t, 0.0 - value);
+    case TYPE_NEGATED_BOOLEAN: LOAD_AS(uint8_t, value == 0.0);
     default: break;
     }
 }
@@ -308,6 +313,9 @@ static void store(const Part *part, Type type, const double *values, void *typed
     case TYPE_UINT16: STORE(uint16_t, clamp(value, 0, UINT16_MAX));
     case TYPE_UINT32: STORE(uint32_t, clamp(value, 0, UINT32_MAX));
     case TYPE_UINT64: STORE(uint64_t, to_uint64(value));
+    case TYPE_NEGATED_FLOAT64: STORE(double, 0.0 - value);
+    case TYPE_NEGATED_INT32: STORE(int32_t, clamp(0.0 - value, INT32_MIN, INT32_MAX));
+    case TYPE_NEGATED_BOOLEAN: STORE(uint8_t, value == 0.0);
     default: break;
     }
 }

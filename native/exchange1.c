@@ -47,12 +47,7 @@ static const Binding bindings[] = {
     {"GetNominalContinuousStates", offsetof(Functions, equations.get_nominals), true},
     {"EventUpdate", offsetof(Functions, update), true},
     {"CompletedIntegratorStep", offsetof(Functions, complete), true},
-    ELEMENT("GetReal", Functions, older.get, TYPE_FLOAT64),
-    ELEMENT("GetInteger", Functions, older.get, TYPE_INT32),
-    ELEMENT("GetBoolean", Functions, older.get, TYPE_BOOLEAN),
-    ELEMENT("SetReal", Functions, older.set, TYPE_FLOAT64),
-    ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),
-    ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
+    BINDINGS_OF_VALUES_1,
     {"SetString", offsetof(Functions, older.set_string), false},
     {"GetString", offsetof(Functions, older.get_string), false},
 };

@@ -38,6 +38,11 @@ typedef enum {
     TYPE_BOOLEAN,
     TYPE_CLOCK, /* whether it ticks; FMI 3.0 */
     TYPE_STRING,
+    /* The same for negated aliases of FMI 1.0, whose values are those of the FMU with the other
+     * sign; of a Boolean, its opposite. */
+    TYPE_NEGATED_FLOAT64,
+    TYPE_NEGATED_INT32,
+    TYPE_NEGATED_BOOLEAN,
     NUMBER_OF_TYPES
 } Type;
 
@@ -193,7 +198,7 @@ const Fmi *fmi_table(int64_t version, int64_t manner);
 
 /* Of one value, in bytes. */
 static inline size_t value_size(const Fmi *fmi, Type type) {
-    static const size_t sizes[NUMBER_OF_TYPES] = {8, 4, 1, 2, 4, 8, 1, 2, 4, 8, 0, 1};
+    static const size_t sizes[NUMBER_OF_TYPES] = {8, 4, 1, 2, 4, 8, 1, 2, 4, 8, 0, 1, 0, 8, 4, 1};
     return type == TYPE_BOOLEAN ? fmi->boolean_size : sizes[type];
 }
 

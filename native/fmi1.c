@@ -31,12 +31,7 @@ static const Binding bindings[] = {
     {"DoStep", offsetof(Functions, do_step), true},
     {"TerminateSlave", offsetof(Functions, older.common.terminate), false},
     {"ResetSlave", offsetof(Functions, older.common.reset), false},
-    ELEMENT("GetReal", Functions, older.get, TYPE_FLOAT64),
-    ELEMENT("GetInteger", Functions, older.get, TYPE_INT32),
-    ELEMENT("GetBoolean", Functions, older.get, TYPE_BOOLEAN),
-    ELEMENT("SetReal", Functions, older.set, TYPE_FLOAT64),
-    ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),
-    ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
+    BINDINGS_OF_VALUES_1,
     {"SetString", offsetof(Functions, older.set_string), false},
     {"GetString", offsetof(Functions, older.get_string), false},
 };

@@ -39,6 +39,22 @@ typedef struct {
 #define ELEMENT(name, table, array, type)                                                          \
     { name, offsetof(table, array) + (type) * sizeof(Function), false }
 
+/* Those of the values of FMI 1.0. The same functions get and set the values behind negated aliases,
+ * which access.c negates. */
+#define BINDINGS_OF_VALUES_1                                                                       \
+    ELEMENT("GetReal", Functions, older.get, TYPE_FLOAT64),                                        \
+    ELEMENT("GetInteger", Functions, older.get, TYPE_INT32),                                       \
+    ELEMENT("GetBoolean", Functions, older.get, TYPE_BOOLEAN),                                     \
+    ELEMENT("SetReal", Functions, older.set, TYPE_FLOAT64),                                        \
+    ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),                                       \
+    ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),                                     \
+    ELEMENT("GetReal", Functions, older.get, TYPE_NEGATED_FLOAT64),                                \
+    ELEMENT("GetInteger", Functions, older.get, TYPE_NEGATED_INT32),                               \
+    ELEMENT("GetBoolean", Functions, older.get, TYPE_NEGATED_BOOLEAN),                             \
+    ELEMENT("SetReal", Functions, older.set, TYPE_NEGATED_FLOAT64),                                \
+    ELEMENT("SetInteger", Functions, older.set, TYPE_NEGATED_INT32),                               \
+    ELEMENT("SetBoolean", Functions, older.set, TYPE_NEGATED_BOOLEAN)
+
 static inline const Common *common_of(const Library *library) {
     return library->functions;
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
@@ -34,6 +34,9 @@ _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
 
+_OPPOSITES: Final = {"Real", "Integer", "Boolean"}
+"""The types of FMI 1.0 whose values can be negated."""
+
 _WORDS: Final = {"co_simulation": "co-simulation", "model_exchange": "model exchange"}
 _ELEMENTS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExchange"}
 
@@ -52,11 +55,8 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     """
     interface, offer = _choose(source, interface)
     experiment = source.defaultExperiment
-    elements = {element.get("name"): element for element in root.find("ModelVariables")}
     capabilities = _capabilities(source, root, interface, offer)
-    variables = {
-        v.name: _convert_variable(v, elements.get(v.name, {})) for v in source.modelVariables
-    }
+    variables = [_convert_variable(*pair) for pair in _with_elements(source, root)]
     return ModelDescription(
         fmi_version=source.fmiVersion,
         model_name=source.modelName or "",
@@ -71,9 +71,9 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         step_size=_time(experiment, "stepSize"),
         fixed_internal_step_size=_time(offer, "fixedInternalStepSize"),
         capabilities=capabilities,
-        variables=variables,
+        variables={v.name: v for v in variables},
         derivatives=_derivatives(source),
-        findings=_findings(source),
+        findings=_findings(source) + _findings_on_aliases(source, root),
         error_categories=_error_categories(root),
         units=_units(root),
         interface=interface,
@@ -91,6 +91,19 @@ def _choose(source: Any, interface: str | None) -> tuple[str, Any]:
             return name, offers[_WORDS[name]]
     words, there = " or ".join(_WORDS[name] for name in wanted), ", ".join(offers) or "none"
     raise FMULoadError(f"{source.modelName} has no interface for {words}; it offers: {there}")
+
+
+def _with_elements(source: Any, root: Any) -> Iterator[tuple[Any, Any]]:
+    """FMPy's variables with their elements of the XML; aliases of FMI 3.0 have that of another.
+
+    Names may come twice.
+    """
+    named = (element for element in root.find("ModelVariables") if element.get("name") is not None)
+    own = [variable for variable in source.modelVariables if variable.alias is None]
+    elements = {id(v): element for v, element in zip(own, named, strict=True)}
+    for variable in source.modelVariables:
+        origin = variable if variable.alias is None else variable.alias
+        yield variable, elements[id(origin)]
 
 
 def _model_exchange(source: Any, offer: Any) -> ModelExchange:
@@ -270,6 +283,7 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
         shift=_shift(source, element, ticking),
         by_fractions=_is_set(element, "supportsFraction"),
+        negated=element.get("alias") == "negatedAlias" and source.type in _OPPOSITES,
     )
 
 
@@ -376,6 +390,15 @@ def _findings(source: Any) -> tuple[str, ...]:
     experiment = _unused_times(source.defaultExperiment, _EXPERIMENT)
     internal = _unused_times(source.coSimulation, ("fixedInternalStepSize",))
     return experiment + internal + _broken_rules(source)
+
+
+def _findings_on_aliases(source: Any, root: Any) -> tuple[str, ...]:
+    return tuple(
+        f"{variable.name!r} is a negated alias of type {variable.type}, which has no negation: its "
+        "value is taken as it is"
+        for variable, element in _with_elements(source, root)
+        if element.get("alias") == "negatedAlias" and variable.type not in _OPPOSITES
+    )
 
 
 def _unused_times(source: Any, attributes: tuple[str, ...]) -> tuple[str, ...]:

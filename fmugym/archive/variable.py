@@ -113,6 +113,8 @@ class Variable:
         driven: Of an array of a system, the places of the elements that something else drives;
             None for arrays of FMUs. FMUs get and set arrays as a whole; in systems each element has
             a value reference of its own, the first one that of the array.
+        negated: Whether its value is that behind its value reference with the other sign, or of a
+            Boolean the opposite: a negated alias of FMI 1.0. All other attributes are its own.
         clocks: The value references of the clocks that must tick whenever the value changes.
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
         interval, shift: Of a clock: the time between its ticks and that before the first one.
@@ -142,6 +144,7 @@ class Variable:
     array: Variable | None = None
     place: int = 0
     driven: frozenset[int] | None = None
+    negated: bool = False
     clocks: tuple[int, ...] = ()
     ticking: str = ""
     interval: Interval = UNKNOWN
@@ -325,7 +328,8 @@ class Variable:
     def integer_limits(self) -> tuple[int, int]:
         """The range of the C type of an integer or enumeration."""
         limits = np.iinfo(_INTEGERS.get(self.type, self.type.lower()))
-        return int(limits.min), int(limits.max)
+        low, high = int(limits.min), int(limits.max)
+        return (-high, -low) if self.negated else (low, high)
 
 
 def checked_value(variable: Variable, value: Any) -> float:

@@ -70,8 +70,11 @@ _TYPES: Final = (
     "Boolean",
     "Clock",
     "String",
+    "-Float64",
+    "-Int32",
+    "-Boolean",
 )
-"""The C types in the order of ``enum Type`` of ``native/fmi.h``."""
+"""The C types in the order of ``enum Type`` of ``native/fmi.h``; those of negated aliases last."""
 
 START_TIME_TYPE: Final = 255
 """Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
@@ -187,7 +190,8 @@ def type_number(variable: Variable, version: int) -> int:
         return _TYPES.index("Float64")
     if variable.kind == "enumeration":
         return _TYPES.index("Int64" if version == 3 else "Int32")
-    return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
+    name = _OLD_NAMES.get(variable.type, variable.type)
+    return _TYPES.index(f"-{name}" if variable.negated else name)
 
 
 def table_of(description: ModelDescription) -> int:

@@ -198,13 +198,13 @@ class Layout:
         return f"the algebraic loop of {', '.join(names)}"
 
 
-_Key: TypeAlias = tuple[int, str, int]
+_Key: TypeAlias = tuple[int, str, int, bool]
 _Slots: TypeAlias = dict[tuple[int, *_Key], int]
 
 
 def _key(variable: Variable) -> _Key:
     """What identifies a value of an FMU; value references of FMI 1.0 and 2.0 have a type."""
-    return variable.value_reference, variable.kind, variable.place
+    return variable.value_reference, variable.kind, variable.place, variable.negated
 
 
 def array_key(end: PartVariable) -> tuple[int, int, str]:

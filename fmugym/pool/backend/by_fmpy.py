@@ -190,15 +190,17 @@ class FMPyInstance:
     # Values.
 
     def _outputs(self) -> list[Any]:
-        return [
-            self._call("reading the outputs", self._method("get", v), [v.value_reference])[0]
+        found = (
+            (v, self._call("reading the outputs", self._method("get", v), [v.value_reference])[0])
             for v in self._spec.outputs
-        ]
+        )
+        return [_opposite(v, value) if v.negated else value for v, value in found]
 
     def _set(self, doing: str, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
             variable = self._fmu.variable(name)
             own = _CONVERSIONS.get(variable.kind, round)(value)
+            own = _opposite(variable, own) if variable.negated else own
             self._call(doing, self._method("set", variable), [variable.value_reference], [own])
 
     def _method(self, verb: str, variable: Variable) -> Callable[..., Any]:
@@ -207,3 +209,8 @@ class FMPyInstance:
         kind = of_enumerations if variable.kind == "enumeration" else variable.type
         method: Callable[..., Any] = getattr(self._slave, f"{verb}{kind}")
         return method
+
+
+def _opposite(variable: Variable, value: Any) -> Any:
+    """The value behind a negated alias, or the other way round."""
+    return not value if variable.kind == "boolean" else 0 - value
