@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
@@ -57,6 +57,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     experiment = source.defaultExperiment
     capabilities = _capabilities(source, root, interface, offer)
     variables = [_convert_variable(*pair) for pair in _with_elements(source, root)]
+    namesakes = _namesakes(variables)
     return ModelDescription(
         fmi_version=source.fmiVersion,
         model_name=source.modelName or "",
@@ -71,8 +72,9 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         step_size=_time(experiment, "stepSize"),
         fixed_internal_step_size=_time(offer, "fixedInternalStepSize"),
         capabilities=capabilities,
-        variables={v.name: v for v in variables},
-        derivatives=_derivatives(source),
+        variables={v.name: v for v in variables if v.name not in namesakes},
+        namesakes=namesakes,
+        derivatives=_derivatives(source, namesakes),
         findings=_findings(source) + _findings_on_aliases(source, root),
         error_categories=_error_categories(root),
         units=_units(root),
@@ -104,6 +106,14 @@ def _with_elements(source: Any, root: Any) -> Iterator[tuple[Any, Any]]:
     for variable in source.modelVariables:
         origin = variable if variable.alias is None else variable.alias
         yield variable, elements[id(origin)]
+
+
+def _namesakes(variables: Sequence[Variable]) -> dict[str, tuple[Variable, ...]]:
+    """The variables of each name that is not unique."""
+    found: dict[str, list[Variable]] = {}
+    for variable in variables:
+        found.setdefault(variable.name, []).append(variable)
+    return {name: tuple(several) for name, several in found.items() if len(several) > 1}
 
 
 def _model_exchange(source: Any, offer: Any) -> ModelExchange:
@@ -174,10 +184,14 @@ def _error_categories(root: Any) -> tuple[str, ...]:
     return tuple(name for name in chosen if name)[:_MOST_CATEGORIES]
 
 
-def _derivatives(source: Any) -> dict[str, str]:
-    """Read the derivatives in ModelStructure, but for those that do not name their states."""
+def _derivatives(source: Any, namesakes: Collection[str]) -> dict[str, str]:
+    """Read the derivatives in ModelStructure, but for those that do not name their states.
+
+    Where one of the two names is not unique, nobody can use the other one.
+    """
     derivatives = [unknown.variable for unknown in source.derivatives]
-    return {d.derivative.name: d.name for d in derivatives if d.derivative}
+    named = {d.derivative.name: d.name for d in derivatives if d.derivative}
+    return {x: d for x, d in named.items() if x not in namesakes and d not in namesakes}
 
 
 def _interfaces(source: Any) -> dict[str, Any]:

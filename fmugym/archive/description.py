@@ -135,7 +135,8 @@ class ModelDescription:
         start_time, stop_time, step_size, fixed_internal_step_size: In seconds; None where the FMU
             gives no usable value.
         tolerance: Of the default experiment; None where the FMU gives no usable value.
-        variables: The variables by name, in the order of the XML.
+        variables: The variables by name, in the order of the XML, but for the ``namesakes``.
+        namesakes: The variables of each name that is not unique, which cannot be used.
         derivatives: For each continuous state that the FMU declares, a scalar or an array, the name
             of its derivative.
         findings: Rules of the standard that the file breaks, as texts.
@@ -167,11 +168,18 @@ class ModelDescription:
     model_exchange: ModelExchange | None = None
     has_event_mode: bool = False
     structure: tuple[tuple[Variable, int], ...] = ()
+    namesakes: Mapping[str, tuple[Variable, ...]] = field(default_factory=dict)
 
     @cached_property
     def fmi_major_version(self) -> int:
         """1, 2 or 3."""
         return int(self.fmi_version.split(".")[0])
+
+    @cached_property
+    def everything(self) -> tuple[Variable, ...]:
+        """The variables with those whose names are not unique."""
+        others = (variable for several in self.namesakes.values() for variable in several)
+        return (*self.variables.values(), *others)
 
     @cached_property
     def state_derivatives(self) -> Mapping[str, str]:
@@ -202,7 +210,7 @@ class ModelDescription:
         """
         needed = any(
             variable.ticking or (variable.causality, variable.variability) == ("input", "discrete")
-            for variable in self.variables.values()
+            for variable in self.everything
         )
         return self.has_event_mode and needed
 
@@ -211,13 +219,13 @@ class ModelDescription:
         """The clocks that tick; none where neither the pool nor model exchange has events."""
         if not self.uses_event_mode and self.model_exchange is None:
             return ()
-        return tuple(v for v in self.variables.values() if v.ticking and not v.shape)
+        return tuple(v for v in self.everything if v.ticking and not v.shape)
 
     @property
     def clocked_inputs(self) -> tuple[Variable, ...]:
         """The inputs that may be set only while one of their clocks ticks."""
         known = {clock.value_reference for clock in self.clocks}
-        inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
+        inputs = (v for v in self.everything if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
 
     def what_drives(self, variable: Variable) -> str | None:
@@ -252,13 +260,14 @@ class ModelDescription:
         """Look a variable, or an element of an array as ``y[2]`` or ``y[1,3]``, up by its name.
 
         Raises:
-            ConfigError: If there is no such variable; the message suggests the nearest name.
+            ConfigError: If there is no such variable, with the nearest name; or if there are
+                several.
         """
         try:
             return self.variables[name]
         except ordinary(Exception):  # a KeyError; or something that is no key at all
             known = list(self.variables)
-        spelt = self._spellings.find(name)
+        spelt = self._spelt(name)
         if spelt is not None:
             return self.variables[spelt]
         array, index = self._array_and_index(name)
@@ -272,10 +281,34 @@ class ModelDescription:
             )
         return array.elements[place]
 
+    def require_unique(self, name: Any) -> None:
+        """Require that a name is not that of several variables.
+
+        Raises:
+            ConfigError: If it is.
+        """
+        several = self.namesakes.get(name) if isinstance(name, str) else None
+        if several is not None:
+            listing = ", ".join(f"{v.causality} (reference {v.value_reference})" for v in several)
+            raise ConfigError(
+                f"{name!r} is the name of {len(several)} variables of {self.model_name}: "
+                f"{listing}; expected a name that is unique"
+            )
+
+    def _spelt(self, name: Any) -> str | None:
+        """The name of a variable as the FMU has it; None if there is none.
+
+        Raises:
+            ConfigError: If there are several.
+        """
+        spelt = self._spellings.find(name)
+        self.require_unique(spelt)
+        return spelt
+
     def _array_and_index(self, name: Any) -> tuple[Variable | None, str]:
         """Take the name of an element apart; no array if it is not the name of one."""
         match = _ELEMENT.fullmatch(name) if isinstance(name, str) else None
-        spelt = None if match is None else self._spellings.find(match[1])
+        spelt = None if match is None else self._spelt(match[1])
         array = None if spelt is None else self.variables[spelt]
         return (array, match[2]) if array and match and array.shape else (None, "")
 
@@ -292,6 +325,8 @@ class ModelDescription:
         chosen = {name: self._checked_size(name, size) for name, size in given.items()}
         variables = {name: v.resized(chosen) for name, v in self.variables.items()}
         solved = self.model_exchange
+        for name in () if solved is None else (*solved.derivatives, *solved.indicators):
+            self.require_unique(name)
         return replace(
             self,
             variables=variables,
@@ -327,8 +362,12 @@ class ModelDescription:
         return number
 
     def find(self, name: str) -> Variable | None:
-        """Do what ``variable`` does, but return None if there is no such variable."""
-        spelt = self._spellings.find(name)
+        """Do what ``variable`` does, but return None if there is no such variable.
+
+        Raises:
+            ConfigError: If there are several.
+        """
+        spelt = self._spelt(name)
         if spelt is not None:
             return self.variables[spelt]
         try:
@@ -344,24 +383,28 @@ class ModelDescription:
         this name.
 
         Raises:
-            ConfigError: If there is no such variable, or an array has too many elements.
+            ConfigError: If there is no such variable, the name is not unique, or an array has too
+                many elements.
         """
-        if isinstance(name, str) and self._spellings.find(name) is None:
+        if isinstance(name, str) and self._spelt(name) is None:
             spelt = Spellings("array", self._named_arrays).find(name)
             if spelt is not None:
+                for variable in self._named_arrays[spelt]:
+                    self.require_unique(variable.name)
                 return self._named_arrays[spelt]
         return self.variable(name).elements
 
     @cached_property
     def _spellings(self) -> Spellings:
-        return Spellings(f"variable of {self.model_name}", self.variables)
+        names = {**self.variables, **self.namesakes}
+        return Spellings(f"variable of {self.model_name}", names)
 
     @cached_property
     def _named_arrays(self) -> Mapping[str, tuple[Variable, ...]]:
         """The scalars that are elements of an array by their names only, by the array's name."""
         found: dict[str, list[tuple[tuple[int, ...], Variable]]] = {}
-        for name, variable in self.variables.items():
-            match = _ELEMENT.fullmatch(name)
+        for variable in self.everything:
+            match = _ELEMENT.fullmatch(variable.name)
             if match is not None and not variable.shape:
                 index = tuple(int(number) for number in match[2].split(","))
                 found.setdefault(match[1], []).append((index, variable))

@@ -140,7 +140,11 @@ class TaskVariables:
         return [self[alias].fmu_variable.name for alias in aliases]
 
     def get(self, alias: str) -> TaskVariable | None:
-        """The variable of an alias or of a variable of the FMU; None if there is none."""
+        """The variable of an alias or of a variable of the FMU; None if there is none.
+
+        Raises:
+            ConfigError: If several variables of the FMU have the name.
+        """
         known = self._variables.keys() | self._entries.keys()
         if alias not in known and alias not in self._description.variables:
             alias = Spellings("name", known).find(alias) or alias

@@ -80,7 +80,7 @@ def _sentence(failure: Failure, description: ModelDescription, name: str) -> str
 
 
 def _name_of(description: ModelDescription, reference: int, kind: str) -> str:
-    some = (v for v in description.variables.values() if v.kind == kind)
+    some = (v for v in description.everything if v.kind == kind)
     return next(v.name for v in some if v.value_reference == reference)
 
 

@@ -134,6 +134,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         fixed_internal_step_size=None,
         capabilities=_capabilities(parts),
         variables=variables,
+        namesakes=_namesakes(plan, parts),
         derivatives=_derivatives(plan, parts),
         findings=plan.findings,
         error_categories=tuple(sorted({c for part in parts for c in part.error_categories})),
@@ -142,6 +143,16 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         parts=tuple(parts),
         ends=ends,
     )
+
+
+def _namesakes(
+    plan: SystemPlan, parts: Sequence[ModelDescription]
+) -> dict[str, tuple[Variable, ...]]:
+    return {
+        f"{component.name}.{name}": several
+        for component, part in zip(plan.components, parts, strict=True)
+        for name, several in part.namesakes.items()
+    }
 
 
 def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, str]:

@@ -52,7 +52,7 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
         the keys. Variables are in the order of the model description.
     """
     description = fmu.description
-    variables = description.variables.values()
+    variables = description.everything
     return {
         "path": str(fmu.path),
         **{name: getattr(description, name) for name in _TEXTS},
