@@ -63,10 +63,21 @@ static const Functions *functions_of(const Library *library) {
     return library->functions;
 }
 
+/* An FMU may leave as it is what has not changed, and fill the rest at events only. */
+static EventInfo info_before(const Events *events) {
+    return (EventInfo){
+        .converged = 1, .has_next_time = events->has_next, .next_time = events->next};
+}
+
+static void take_info(const EventInfo *info, Events *events) {
+    *events = (Events){info->converged == 0, info->terminate != 0, info->has_next_time != 0,
+                       info->next_time};
+}
+
 static Status initialize(const Library *library, void *component, const Experiment *e,
-                         StartValues start_values, const char **doing) {
+                         StartValues start_values, const char **doing, Events *events) {
     const Functions *f = functions_of(library);
-    EventInfo info = {0};
+    EventInfo info = info_before(events);
 
     *doing = "setting the start values";
     Status status = start_values.set(start_values.context);
@@ -74,18 +85,19 @@ static Status initialize(const Library *library, void *component, const Experime
         *doing = "initialization";
         status = sane(f->equations.set_time(component, e->start_time));
     }
-    return status > STATUS_WARNING
-               ? status
-               : sane(f->initialize(component, e->has_tolerance, e->tolerance, &info));
+    if (status <= STATUS_WARNING) {
+        status = sane(f->initialize(component, e->has_tolerance, e->tolerance, &info));
+    }
+    take_info(&info, events);
+    return status;
 }
 
 /* The FMU repeats the update by itself, since it need not tell intermediate results. */
 static Status update(const Library *library, void *component, Events *events) {
-    EventInfo info = {0};
+    EventInfo info = info_before(events);
     const Status status = sane(functions_of(library)->update(component, 0, &info));
 
-    *events = (Events){info.converged == 0, info.terminate != 0, info.has_next_time != 0,
-                       info.next_time};
+    take_info(&info, events);
     return status;
 }
 
@@ -101,7 +113,6 @@ static Status complete(const Library *library, void *component, bool *event, boo
 /* The FMU itself, without a solver. */
 static const Fmi fmu = {
     .boolean_size = sizeof(char),
-    .initialize = initialize,
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
@@ -113,6 +124,7 @@ static const Model model = {
     .fmi = &fmu,
     .equations = offsetof(Functions, equations),
     .update = update,
+    .initialize = initialize,
     .complete = complete,
 };
 

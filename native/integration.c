@@ -126,7 +126,9 @@ Status solver_enter_events(Solver *me) {
 }
 
 static Status update(Solver *me, Events *events) {
-    *events = (Events){0};
+    const double next = me->memory.next_event;
+
+    *events = (Events){.has_next = next > me->memory.time && next < INFINITY, .next = next};
     const Status status = me->model->update(me->library, me->component, events);
 
     solver_restore_floats(me);

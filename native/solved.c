@@ -96,6 +96,20 @@ static Status prepare(void *solver) {
     return clocks_prepare(solver);
 }
 
+static Status initialize(Solver *me, const Experiment *experiment, StartValues start_values,
+                         const char **doing) {
+    Events events = {0};
+
+    if (me->model->initialize == NULL) {
+        return fmi_of(me)->initialize(me->library, me->component, experiment, start_values, doing);
+    }
+    const Status status = me->model->initialize(me->library, me->component, experiment,
+                                                start_values, doing, &events);
+    me->memory.terminated = events.terminate;
+    me->memory.next_event = events.has_next ? events.next : INFINITY;
+    return status;
+}
+
 /* Afterwards the FMU is in continuous time, unless it has asked to stop: the first step then tells
  * so. */
 Status solved_initialize(const Library *library, void *component, const Experiment *experiment,
@@ -108,8 +122,7 @@ Status solved_initialize(const Library *library, void *component, const Experime
         start_values.prepare = prepare;
         start_values.prepared = me;
     }
-    const Status status =
-        fmi_of(me)->initialize(library, me->component, experiment, start_values, doing);
+    const Status status = initialize(me, experiment, start_values, doing);
     if (!good(status)) {
         return status;
     }

@@ -33,6 +33,8 @@ typedef struct {
 typedef struct Model {
     const Fmi *fmi;   /* of the FMU itself */
     size_t equations; /* where they are in the library's table of functions */
+    /* Updates the discrete states. The events are known before, and what the FMU leaves as it is
+     * stays so. */
     Status (*update)(const Library *library, void *component, Events *events);
     /* Tells the FMU that a step is complete. It may want an event, or to stop. */
     Status (*complete)(const Library *library, void *component, bool *event, bool *terminate);
@@ -40,6 +42,9 @@ typedef struct Model {
     Status (*differentiate)(const Library *library, void *component, const uint32_t *rates,
                             size_t count, uint32_t state, double *column);
     size_t clocks; /* where the functions for clocks are in that table; 0 before FMI 3.0 */
+    /* Initializes the FMU and tells the first events; NULL where it is done like in co-simulation. */
+    Status (*initialize)(const Library *library, void *component, const Experiment *experiment,
+                         StartValues start_values, const char **doing, Events *events);
     /* Lets the FMU step; NULL in model exchange. The FMU may return early, and may want an event
      * or to stop. */
     Status (*step)(const Library *library, void *component, double time, double size,

@@ -4,6 +4,11 @@
 #include "exchange.h"
 
 #include <stdlib.h>
+#include <string.h>
+
+#ifndef SPARSE
+#define SPARSE 0
+#endif
 
 typedef struct {
     void *logger, *allocate, *release;
@@ -32,11 +37,18 @@ int Model_fmiSetTime(Model *me, double time) {
     return core_set_time(me, time);
 }
 
-static int settle(Model *me, EventInfo *info) {
+/* With SPARSE, tells nothing where nothing has happened, as some tools do. */
+static int settle(Model *me, EventInfo *info, bool first) {
+    const Model before = *me;
     int status = core_update(me);
 
     while (status == OK && me->again) {
         status = core_update(me);
+    }
+    const bool changed = me->stops || me->next_event != before.next_event ||
+                         memcmp(me->v, before.v, sizeof me->v) != 0;
+    if (SPARSE && !first && !changed) {
+        return status != OK ? status : core_enter_continuous(me);
     }
     *info = (EventInfo){.converged = 1,
                         .terminate = me->stops,
@@ -49,13 +61,13 @@ static int settle(Model *me, EventInfo *info) {
 int Model_fmiInitialize(Model *me, char has_tolerance, double tolerance, EventInfo *info) {
     const int status = core_enter_initialization(me, me->time);
 
-    return status != OK || core_exit_initialization(me) != OK ? ERROR : settle(me, info);
+    return status != OK || core_exit_initialization(me) != OK ? ERROR : settle(me, info, true);
 }
 
 int Model_fmiEventUpdate(Model *me, char intermediate_results, EventInfo *info) {
     const int status = core_enter_events(me);
 
-    return status != OK ? status : settle(me, info);
+    return status != OK ? status : settle(me, info, false);
 }
 
 int Model_fmiTerminate(Model *me) {

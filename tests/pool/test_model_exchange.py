@@ -249,6 +249,18 @@ class TestEvents:
         found = run(opened(open_pool(fmu, (), ["mode"])), 600)[:, 0]
         assert found.tolist() == [row[2] for row in stick_and_slip(0.1, 600)]
 
+    @pytest.mark.parametrize("model", ["stair", "ball"])
+    def test_are_told_at_events_only(self, tmp_path, opened, model):
+        """FMI 1.0: what ``fmiEventUpdate`` leaves as it is stays so, as in FMPy."""
+        outputs = {"stair": ["count"], "ball": ["h", "bounces"]}[model]
+        played = []
+        for name, options in (("full", ()), ("sparse", ("-DSPARSE=1",))):
+            path = exchange_tools.exchange_fmu(tmp_path / f"{name}.fmu", model, 1, options=options)
+            pool = start(opened(open_pool(FMU(path, probe_timeout=None), (), outputs, 0.3)))
+            played.append([step(pool) for _ in range(30)])
+        np.testing.assert_array_equal(*played)
+        assert played[0][-1][-1, 0] > 3
+
     def test_time_does_not_drift(self, make_pool):
         """The period of the source stays where it is through a million steps."""
         pool = make_pool("circuit", 0.05, outputs=["voltage"])
