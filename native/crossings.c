@@ -10,6 +10,17 @@ enum { MOST_GUESSES = 200 }; /* of the time of one event */
 
 static const double SHARP = 1e-3; /* part of the tolerance to which events are located */
 
+Status solver_check_indicators(const Solver *me, const double *z) {
+    for (size_t i = 0; i < me->solving->indicators; i++) {
+        if (isnan(z[i])) {
+            solver_restore_floats(me);
+            return solver_fail(me, "event indicator %zu of %zu is NaN after t = %.17g s", i + 1,
+                               me->solving->indicators, me->memory.time);
+        }
+    }
+    return STATUS_OK;
+}
+
 /* An interval of fractions of a step: no indicator has crossed zero at low, one has at high. */
 typedef struct {
     double low, high;

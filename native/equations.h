@@ -38,7 +38,9 @@ static inline Status equations_rates(Solver *me, double *rates) {
 
 static inline Status equations_indicators(Solver *me, double *z) {
     const size_t count = me->solving->indicators;
-    return count == 0 ? STATUS_OK : sane(me->equations->get_indicators(me->component, z, count));
+    const Status status =
+        count == 0 ? STATUS_OK : sane(me->equations->get_indicators(me->component, z, count));
+    return good(status) ? solver_check_indicators(me, z) : status;
 }
 
 /* Moves the FMU to a time and state. */

@@ -118,6 +118,8 @@ Status solver_locate(Solver *me, double *end);
 static inline bool solver_crosses(const Solver *me, const double *before, const double *after) {
     bool any = false;
 
+/* In crossings.c: fails if an indicator is NaN, which has no sign. */
+Status solver_check_indicators(const Solver *me, const double *z);
     for (size_t i = 0; i < me->solving->indicators; i++) {
         any |= (before[i] > 0.0) != (after[i] > 0.0);
     }
