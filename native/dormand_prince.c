@@ -60,6 +60,21 @@ static Status step(Solver *me, double end, double *error) {
     return status;
 }
 
+/* The product of the step and the largest eigenvalue, as Hairer and Wanner estimate it from the last two
+ * stages, which are both at the end: Solving Ordinary Differential Equations II, section IV.2. */
+static double stiffness(Solver *me, double end) {
+    const double size = end - me->memory.time;
+    const double *before = me->stages + (STAGES - 2) * me->n, *last = before + me->n;
+
+    for (size_t i = 0; i < me->n; i++) {
+        const double sum = weighted_sum(weights[STAGES - 2], STAGES - 2, me->stages + i, me->n);
+        me->trial[i] = size * (last[i] - before[i]);
+        me->found[i] = me->next[i] - (me->x[i] + size * sum);
+    }
+    const double distance = solver_norm(me, me->found);
+    return distance > 0.0 ? solver_norm(me, me->trial) / distance : 0.0;
+}
+
 static Status between(Solver *me, double end, double fraction, double *x) {
     const double size = end - me->memory.time, rest = 1.0 - fraction;
     const double *last = me->stages + (STAGES - 1) * me->n;
@@ -80,4 +95,5 @@ const Method dormand_prince = {.name = "dormand_prince",
                                .order = 5.0,
                                .last = STAGES - 1,
                                .step = step,
+                               .stiffness = stiffness,
                                .between = between};

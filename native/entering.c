@@ -6,12 +6,16 @@
 
 enum { NESTED = 8 }; /* deeper nesting is not noticed */
 
+static const uint64_t PATIENCE = 20000000; /* ns from one question to the caller to the next one */
+
 static THREAD_LOCAL struct {
-    const Pool *pools[NESTED];
+    Pool *pools[NESTED];
     size_t depth;
+    Caller caller;
+    uint64_t asked; /* when the caller was asked last */
 } inside;
 
-void begin_inside(const Pool *pool) {
+void begin_inside(Pool *pool) {
     if (inside.depth < NESTED) {
         inside.pools[inside.depth] = pool;
     }
@@ -31,12 +35,48 @@ bool is_inside(const Pool *pool) {
     return false;
 }
 
+static Pool *innermost(void) {
+    return inside.depth > 0 && inside.depth <= NESTED ? inside.pools[inside.depth - 1] : NULL;
+}
+
+Caller inside_of_caller(Caller caller) {
+    const Caller before = inside.caller;
+
+    inside.caller = caller;
+    return before;
+}
+
+static bool caller_wants_end(void) {
+    const uint64_t now = clock_now();
+
+    if (inside.caller.wants_end == NULL || now - inside.asked < PATIENCE) {
+        return false;
+    }
+    inside.asked = now;
+    return inside.caller.wants_end(inside.caller.context);
+}
+
+bool is_interrupted(void) {
+    Pool *pool = innermost();
+
+    if (pool != NULL && !atomic_get(&pool->interrupted) && caller_wants_end()) {
+        atomic_set(&pool->interrupted, 1);
+    }
+    return pool != NULL && atomic_get(&pool->interrupted);
+}
+
+bool is_first_to_find_stiff(void) {
+    Pool *pool = innermost();
+    return pool != NULL && !atomic_or_bits(&pool->found_stiff, 1);
+}
+
 static Entry enter_locked(Pool *pool) {
     if (!pool->open) {
         mutex_unlock(&pool->lock);
         return ENTRY_CLOSED;
     }
     begin_inside(pool);
+    atomic_set(&pool->interrupted, 0);
     pool->floats = floats_now();
     return ENTRY_ENTERED;
 }

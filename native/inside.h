@@ -6,9 +6,25 @@
 #include "pool.h"
 
 /* begin_inside records that this thread is inside a pool; end_inside ends that. */
-void begin_inside(const Pool *pool);
+void begin_inside(Pool *pool);
 void end_inside(void);
 
 bool is_inside(const Pool *pool);
+
+/* Whoever calls a pool may want its work to end early, because a signal has come. */
+typedef struct {
+    bool (*wants_end)(void *context);
+    void *context;
+} Caller;
+
+/* Sets that of this thread, and returns the one before. There is none at first. */
+Caller inside_of_caller(Caller caller);
+
+/* Whether the work of the innermost pool is to end early. Asks the caller of this thread now and then;
+ * threads that help have none. */
+bool is_interrupted(void);
+
+/* Whether the stiffness of the innermost pool's equations is told for the first time. */
+bool is_first_to_find_stiff(void);
 
 #endif

@@ -4,13 +4,22 @@
 #include <string.h>
 
 #include "equations.h"
+#include "inside.h"
 
 enum {
     MOST_UPDATES = 1000,  /* of the discrete states in one event */
-    MOST_EVENTS = 100000  /* in one communication step */
+    MOST_EVENTS = 100000, /* in one communication step */
+    MOST_TRIES = 1000000, /* of steps in one communication step */
+    MOST_ERRORS = 10,     /* of the FMU in tries of one step */
+    MANY_TRIES = 40,      /* from which stiffness is looked for */
+    EVERY_TRY = 2,        /* in each so many of them */
+    STIFF_TRIES = 15,     /* that tell stiffness, */
+    CALM_TRIES = 6        /* unless so many others are between them */
 };
 
-static const double GROWTH = 6.0, SHRINKAGE = 0.2, SAFETY = 0.9;
+static const double GROWTH = 6.0, SHRINKAGE = 0.2, HALF = 0.5, SAFETY = 0.9;
+static const char ADVICE[] = "; for stiff equations, set solver = \"rosenbrock\"";
+static const double STIFF = 3.25; /* step times eigenvalue where explicit methods become unstable */
 static const double SMALL = 0.01;   /* part of a nominal value that errors are compared with */
 static const double FIRST = 0.01;   /* part of its value that a state changes in the first step */
 static const double ROUNDED = 1.0 + 1e-6; /* a step may be longer than allowed by a rounding */
@@ -205,6 +214,7 @@ static double first_step(const Solver *me) {
 
 /* Divides what remains so that no very short step is left at the end. */
 static double size_of_step(Solver *me, double remaining) {
+    const double shortest = resolution(me, me->memory.time + remaining);
     const double most = me->solving->max_step;
 
     if (me->solving->method->order == 0.0) {
@@ -213,7 +223,7 @@ static double size_of_step(Solver *me, double remaining) {
     if (!(me->memory.step > 0.0)) {
         me->memory.step = first_step(me);
     }
-    const double size = smaller(me->memory.step, most);
+    const double size = larger(smaller(me->memory.step, most), shortest);
     if (remaining <= smaller(1.1 * size, ROUNDED * most)) {
         return remaining;
     }
@@ -231,28 +241,81 @@ static void accept(Solver *me, double size, double error) {
     me->memory.step = size < me->memory.step ? larger(me->memory.step, proposed) : proposed;
 }
 
+/* Counts tries, which may be many without end: the equations may be stiff, or not smooth. */
+static Status count_try(Solver *me) {
+    const Method *method = me->solving->method;
+
+    if (solver_is_interrupted(me)) {
+        return solver_fail(me, "the step was interrupted at t = %.17g s", me->memory.time);
+    }
+    if (++me->tries <= MOST_TRIES) {
+        return STATUS_OK;
+    }
+    return solver_fail(me,
+                       "%s needs more than %d steps in a communication step, the last at t = %.17g s%s",
+                       method == &by_fmu ? "the FMU" : method->name, MOST_TRIES, me->memory.time,
+                       method->stiffness != NULL ? ADVICE : "");
+}
+
+/* Tells once that the method is not the right one. Counts tries, not time. */
+static void watch_stiffness(Solver *me, double end) {
+    const Method *method = me->solving->method;
+
+    if (method->stiffness == NULL || me->tries < MANY_TRIES || me->tries % EVERY_TRY > 0) {
+        return;
+    }
+    const bool stiff = method->stiffness(me, end) > STIFF;
+    me->calm = stiff ? 0 : me->calm + 1;
+    me->stiff = stiff ? me->stiff + 1 : me->calm == CALM_TRIES ? 0 : me->stiff;
+    if (me->stiff == STIFF_TRIES && is_first_to_find_stiff()) {
+        solver_warn(me,
+                    "the equations are stiff at t = %.3g s: %s has taken %zu steps in this communication "
+                    "step; solver = \"rosenbrock\" takes fewer",
+                    me->memory.time, method->name, me->tries);
+    }
+}
+
+/* What the FMU may refuse in a try: a shorter one may not ask for it. */
+static bool may_retry(Status status, int errors) {
+    return status == STATUS_DISCARD || (status == STATUS_ERROR && errors < MOST_ERRORS);
+}
+
+static double shrinkage(const Solver *me, Status status, double error) {
+    if (status == STATUS_ERROR) {
+        return HALF;
+    }
+    const bool finite = good(status) && error <= DBL_MAX;
+    return finite ? smaller(SAFETY, factor_after(me, error)) : SHRINKAGE;
+}
+
 /* Tries shorter and shorter steps until the error is within the tolerance. Only a method without
- * an estimate passes on that the FMU discards a call. */
+ * an estimate passes on that the FMU discards a call, or fails in it, at once. */
 static Status take_step(Solver *me, double until, double *end) {
     const Method *method = me->solving->method;
     const double remaining = until - me->memory.time;
     double size = size_of_step(me, remaining), error;
 
-    for (;;) {
+    for (int errors = 0;;) {
         *end = size >= remaining ? until : me->memory.time + size;
-        const Status status = method->step(me, *end, &error);
-        if (method->order == 0.0 || (!good(status) && status != STATUS_DISCARD)) {
+        Status status = count_try(me);
+        if (!good(status)) {
+            return status;
+        }
+        status = method->step(me, *end, &error);
+        if (method->order == 0.0 || (!good(status) && !may_retry(status, errors))) {
             return status;
         }
         if (good(status) && error <= 1.0) {
+            watch_stiffness(me, *end);
             accept(me, size, error);
             return status;
         }
-        const bool finite = good(status) && error <= DBL_MAX;
-        me->memory.step = size *= finite ? smaller(SAFETY, factor_after(me, error)) : SHRINKAGE;
+        errors += status == STATUS_ERROR;
+        me->memory.step = size *= shrinkage(me, status, error);
         if (size < resolution(me, until)) {
-            return solver_fail(me, "the solver %s needs steps below %.3g s at t = %.17g s", method->name,
-                        size, me->memory.time);
+            return solver_fail(me, "the solver %s needs steps below %.3g s at t = %.17g s%s",
+                               method->name, size, me->memory.time,
+                               good(status) ? "" : ", since the FMU fails in longer ones");
         }
     }
 }
@@ -328,7 +391,11 @@ static Status step_by_fmu(Solver *me, double until) {
     const double time = me->memory.time;
     double reached = until;
     bool event = false, terminate = false;
-    const Status status = me->model->step(me->library, me->component, time, until - time, &reached,
+    Status status = count_try(me);
+    if (!good(status)) {
+        return status;
+    }
+    status = me->model->step(me->library, me->component, time, until - time, &reached,
                                           &event, &terminate);
 
     solver_restore_floats(me);
@@ -382,7 +449,7 @@ Status solver_advance(Solver *me, double until) {
     Memory *memory = &me->memory;
     Status status = STATUS_OK;
 
-    me->events = 0;
+    me->events = me->tries = me->stiff = me->calm = 0;
     if (memory->mode == IN_EVENTS && !memory->terminated) {
         status = solver_settle(me);
     } else if (me->stale) {

@@ -19,6 +19,9 @@ typedef struct Method {
     /* Computes next at this time from x and the rates, and the norm of the error: above 1, the
      * step is too large. */
     Status (*step)(struct Solver *me, double end, double *error);
+    /* How much longer the step is than that in which the rates change by the states; for a method whose
+     * steps stiffness makes short, otherwise NULL. */
+    double (*stiffness)(struct Solver *me, double end);
     /* The state at a fraction of the step from the time of the memory to the end. */
     Status (*between)(struct Solver *me, double end, double fraction, double *x);
 } Method;

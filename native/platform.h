@@ -146,6 +146,10 @@ static inline void mutex_destroy(Mutex *m) {
 static inline void condition_wait(Condition *c, Mutex *m) {
     SleepConditionVariableSRW(c, m, INFINITE, 0);
 }
+/* Returns false after so many ms. */
+static inline bool condition_wait_for(Condition *c, Mutex *m, int milliseconds) {
+    return SleepConditionVariableSRW(c, m, (DWORD)milliseconds, 0) != 0;
+}
 static inline void condition_wake_one(Condition *c) {
     WakeConditionVariable(c);
 }
@@ -174,6 +178,16 @@ static inline void mutex_destroy(Mutex *m) {
 }
 static inline void condition_wait(Condition *c, Mutex *m) {
     pthread_cond_wait(c, m);
+}
+/* Returns false after so many ms. */
+static inline bool condition_wait_for(Condition *c, Mutex *m, int milliseconds) {
+    struct timespec end;
+
+    clock_gettime(CLOCK_REALTIME, &end);
+    end.tv_nsec += (long)(milliseconds % 1000) * 1000000;
+    end.tv_sec += milliseconds / 1000 + end.tv_nsec / 1000000000;
+    end.tv_nsec %= 1000000000;
+    return pthread_cond_timedwait(c, m, &end) == 0;
 }
 static inline void condition_wake_one(Condition *c) {
     pthread_cond_signal(c);

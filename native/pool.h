@@ -188,6 +188,8 @@ typedef struct Pool {
     Snapshot *snapshots;
     Records *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
+    Atomic interrupted; /* whether the present call is to end early */
+    Atomic found_stiff; /* whether that was told of the equations */
     Cost costs[OPERATIONS];
     Atomic states_too_large;
     Atomic no_categories; /* whether the FMU is asked no more to log why calls fail */

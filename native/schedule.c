@@ -145,7 +145,7 @@ typedef struct {
 /* Any thread may do this. Only the caller's is inside the pool already. */
 static void work_on_rest(void *context, size_t begin, size_t end) {
     const Rest *rest = context;
-    const Pool *pool = rest->task->pool;
+    Pool *pool = rest->task->pool;
 
     begin_inside(pool);
     work(rest->task, rest->first + begin, rest->first + end);
@@ -159,6 +159,11 @@ static size_t number_of_helpers(const Task *task, double total) {
     const size_t wanted = at_least_one(total / WORTH_A_THREAD) - 1;
 
     return task->call->alone ? 0 : wanted < most ? wanted : most;
+}
+
+/* While others work, the caller's thread looks whether they are to end. */
+static void look(void) {
+    (void)is_interrupted();
 }
 
 static void run(Task *task, double cost, size_t first, size_t count) {
@@ -175,6 +180,7 @@ static void run(Task *task, double cost, size_t first, size_t count) {
         .smallest = at_least_one(SMALLEST_CHUNK / cost),
         .largest = at_least_one(LARGEST_CHUNK / cost),
         .lasting = cost >= LASTING,
+        .look = look,
     };
     threads_run(&job);
 }

@@ -82,6 +82,10 @@ typedef struct Solver {
     bool knows_indicators; /* whether z are those at x */
     bool has_jacobian;     /* whether the method's Jacobian is that at x */
     size_t events;         /* handled in this communication step */
+    size_t tries;          /* of steps in this communication step */
+    size_t stiff, calm;    /* which of them were as long as stability allows, and which not */
+    uint64_t looked;       /* when it last read the clock, in ns */
+    size_t unseen;         /* tries until it reads the clock again */
     size_t n;              /* number of states */
     double *arrays;        /* the memory of all that follow */
     double *x, *rates;     /* at the time of the memory */
@@ -114,20 +118,23 @@ Status solver_advance(Solver *me, double until);
 /* In crossings.c: finds the first crossing in the step that ends at *end. Moves the end and next to just after
  * it. */
 Status solver_locate(Solver *me, double *end);
+/* In crossings.c: fails if an indicator is NaN, which has no sign. */
+Status solver_check_indicators(const Solver *me, const double *z);
 /* Whether an indicator becomes positive or ceases to be: FMI's events. */
 static inline bool solver_crosses(const Solver *me, const double *before, const double *after) {
     bool any = false;
 
-/* In crossings.c: fails if an indicator is NaN, which has no sign. */
-Status solver_check_indicators(const Solver *me, const double *z);
     for (size_t i = 0; i < me->solving->indicators; i++) {
         any |= (before[i] > 0.0) != (after[i] > 0.0);
     }
     return any;
 }
 
-/* In solver.c. Logs a message like one of the FMU, and returns an Error. */
+/* In solver.c. Both log a message like one of the FMU. This one returns an Error. */
 Status solver_fail(const Solver *me, const char *format, ...);
+void solver_warn(const Solver *me, const char *format, ...);
+/* Whether the step is to end early. */
+bool solver_is_interrupted(Solver *me);
 
 static inline void solver_restore_floats(const Solver *me) {
     floats_restore_if_seen(me->floats);

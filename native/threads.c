@@ -30,7 +30,8 @@ enum {
     FANOUT = 2,           /* number of helpers that each thread wakes */
     STACK_SIZE = 8 << 20, /* as for the main thread on most systems: FMUs may rely on it */
     HELPER_SPIN = 20000,  /* ns to look for more work before going to sleep */
-    CALLER_SPIN = 5000    /* ns to wait for the last chunks before going to sleep */
+    CALLER_SPIN = 5000,   /* ns to wait for the last chunks before going to sleep */
+    CALLER_LOOK = 50      /* ms to sleep before it looks what else there is */
 };
 
 /* The ticket of a range: epoch << 32 | next item. Mostly, different threads write the tickets. */
@@ -360,7 +361,11 @@ static void wait_for_chunks(Slot *slot, size_t count) {
     mutex_lock(&slot->lock);
     atomic_set(&slot->waiting, 1);
     while (atomic_get(&slot->done) != count) {
-        condition_wait(&slot->finished, &slot->lock);
+        if (!condition_wait_for(&slot->finished, &slot->lock, CALLER_LOOK)) {
+            mutex_unlock(&slot->lock);
+            slot->job.look();
+            mutex_lock(&slot->lock);
+        }
     }
     atomic_set(&slot->waiting, 0);
     mutex_unlock(&slot->lock);

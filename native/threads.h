@@ -15,6 +15,7 @@ typedef struct {
     size_t smallest; /* smallest chunk in items, at least 1 */
     size_t largest;
     bool lasting; /* whether a single item takes much longer than to wake a helper */
+    void (*look)(void); /* what the caller does now and then while it waits for the last chunks */
 } Job;
 
 /* Works through all items on the calling thread and on free helpers. Returns when all items are

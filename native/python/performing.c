@@ -4,6 +4,8 @@
 
 #include "python.h"
 
+#include "inside.h"
+
 PyObject *sleep_function;
 
 PyObject *find_object(const char *module_name, const char *name) {
@@ -97,19 +99,56 @@ bool explain_entry(Entry entry) {
     return entry == ENTRY_ENTERED;
 }
 
+/* Signals that come while a pool works. */
+typedef struct {
+    PyThreadState *released; /* NULL if the thread has the GIL */
+    PyObject *type, *value, *traceback; /* what a handler has raised */
+} Signals;
+
+/* Lets the handlers of signals run. Work ends early if one of them raises an exception, which waits
+ * until the pool is left. */
+static bool handle_signals(void *context) {
+    Signals *me = context;
+    const bool released = me->released != NULL;
+
+    if (released) {
+        PyEval_RestoreThread(me->released);
+    }
+    const bool raised = PyErr_CheckSignals() < 0;
+    if (raised) {
+        PyErr_Fetch(&me->type, &me->value, &me->traceback);
+    }
+    if (released) {
+        me->released = PyEval_SaveThread();
+    }
+    return raised;
+}
+
+static void work_and_leave(PyPool *self, Work *work, void *context, Signals *signals) {
+    const Caller before = inside_of_caller((Caller){handle_signals, signals});
+
+    work(self, signals->released == NULL, context);
+    inside_of_caller(before);
+    pool_leave(&self->pool);
+}
+
 bool perform(PyPool *self, int length, Work *work, void *context) {
     Entry entry = pool_try_enter(&self->pool);
+    Signals signals = {0};
 
     if (entry == ENTRY_ENTERED && is_short(self, length)) {
-        work(self, true, context);
-        pool_leave(&self->pool);
+        work_and_leave(self, work, context, &signals);
     } else if (entry == ENTRY_ENTERED || entry == ENTRY_BUSY) {
-        Py_BEGIN_ALLOW_THREADS entry = entry == ENTRY_BUSY ? pool_enter(&self->pool) : entry;
+        signals.released = PyEval_SaveThread();
+        entry = entry == ENTRY_BUSY ? pool_enter(&self->pool) : entry;
         if (entry == ENTRY_ENTERED) {
-            work(self, false, context);
-            pool_leave(&self->pool);
+            work_and_leave(self, work, context, &signals);
         }
-        Py_END_ALLOW_THREADS
+        PyEval_RestoreThread(signals.released);
+    }
+    if (signals.type != NULL) {
+        PyErr_Restore(signals.type, signals.value, signals.traceback);
+        return false;
     }
     return explain_entry(entry);
 }

@@ -15,6 +15,7 @@ STATES = {
     "relay": ["x"],
     "sun": ["x"],
     "season": ["x"],
+    "wild": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -31,10 +32,11 @@ OTHERS = {
     "relay": ["turns", "last", "speed", "steps"],
     "sun": ["now", "sine", "seconds", "u"],
     "season": ["u"],
+    "wild": ["kind", "calls", "delay"],
 }
 """The other variables in the order of their value references."""
 
-INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
+INDICATORS = {"ball": 1, "friction": 2, "circuit": 1, "wild": 1}
 INPUTS = {"u", "duty", "e"}
 OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns", "steps"}
 OUTPUTS |= {"y", "calls", "now", "sine", "seconds"}
@@ -50,6 +52,7 @@ START = {
     "relay": {"x": 0, "last": 1e9, "speed": 1},
     "sun": {"x": 0, "u": 0},
     "season": {"x": 1, "u": 0},
+    "wild": {"x": 0.01, "kind": 0, "delay": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}
