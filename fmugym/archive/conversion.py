@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
@@ -56,7 +56,8 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     interface, offer = _choose(source, interface)
     experiment = source.defaultExperiment
     capabilities = _capabilities(source, root, interface, offer)
-    variables = [_convert_variable(*pair) for pair in _with_elements(source, root)]
+    pairs = list(_with_elements(source, root))
+    variables = [_convert_variable(*pair) for pair in pairs]
     namesakes = _namesakes(variables)
     return ModelDescription(
         fmi_version=source.fmiVersion,
@@ -75,7 +76,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         variables={v.name: v for v in variables if v.name not in namesakes},
         namesakes=namesakes,
         derivatives=_derivatives(source, namesakes),
-        findings=_findings(source) + _findings_on_aliases(source, root),
+        findings=_findings(source) + _of_aliases(pairs),
         error_categories=_error_categories(root),
         units=_units(root),
         interface=interface,
@@ -295,7 +296,7 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         clocks=tuple(map(int, (element.get("clocks") or "").split())),
         ticking=ticking,
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
-        shift=_shift(source, element, ticking),
+        shift=_shift(source, element, ticking) if ticking else UNKNOWN,
         by_fractions=_is_set(element, "supportsFraction"),
         negated=element.get("alias") == "negatedAlias" and source.type in _OPPOSITES,
     )
@@ -406,11 +407,12 @@ def _findings(source: Any) -> tuple[str, ...]:
     return experiment + internal + _broken_rules(source)
 
 
-def _findings_on_aliases(source: Any, root: Any) -> tuple[str, ...]:
+def _of_aliases(pairs: Iterable[tuple[Any, Any]]) -> tuple[str, ...]:
+    """The findings on aliases of FMI 1.0."""
     return tuple(
         f"{variable.name!r} is a negated alias of type {variable.type}, which has no negation: its "
         "value is taken as it is"
-        for variable, element in _with_elements(source, root)
+        for variable, element in pairs
         if element.get("alias") == "negatedAlias" and variable.type not in _OPPOSITES
     )
 

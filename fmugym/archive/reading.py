@@ -6,9 +6,13 @@ can unpack to gigabytes, and each element takes a quarter of a kilobyte once it 
 
 from __future__ import annotations
 
+import gc
+import hashlib
 import io
 import re
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import fmpy
@@ -16,6 +20,7 @@ from lxml import etree
 
 from fmugym.archive.conversion import convert
 from fmugym.archive.description import ModelDescription
+from fmugym.archive.kept import keep, kept
 from fmugym.archive.safe_zip import SafeZip, check_limit
 from fmugym.errors import FMULoadError, reason
 from fmugym.signals import ordinary
@@ -23,6 +28,9 @@ from fmugym.signals import ordinary
 __all__ = ["parse_xml", "read_model_description", "read_root", "read_xml"]
 
 _XML: Final = "modelDescription.xml"
+_LARGE: Final = 2**18
+"""From so many bytes on, what was read is kept in the cache folder: some thousand variables."""
+
 _MARKUP_PER_VARIABLE: Final = 25
 """Elements and attributes that a file may have for each of ``max_variables``."""
 
@@ -57,8 +65,37 @@ def read_model_description(archive: SafeZip, interface: str | None = None) -> Mo
     Raises:
         FMULoadError: If the XML is missing, too large or unreadable, or lacks the interface.
     """
-    name = archive.path.name
-    content = _without_dependencies(_read_content(archive))
+    content = _read_content(archive)
+    if len(content) < _LARGE:
+        return _read(archive, content, interface)
+    with _pausing_the_collector():
+        return _read_or_recall(archive, content, interface)
+
+
+@contextmanager
+def _pausing_the_collector() -> Iterator[None]:
+    """Let Python not look for garbage: all of the many objects that are made now are kept."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _read_or_recall(archive: SafeZip, content: bytes, interface: str | None) -> ModelDescription:
+    limit = archive.limits.max_variables
+    key = f"{hashlib.sha256(content).hexdigest()} {interface} {limit}"
+    description = kept(key)
+    if description is None:
+        description = _read(archive, content, interface)
+        keep(key, description)
+    return description
+
+
+def _read(archive: SafeZip, content: bytes, interface: str | None) -> ModelDescription:
+    name, content = archive.path.name, _without_dependencies(content)
     root = _parse_content(archive, content)
     try:
         return convert(_parse_with_fmpy(content), root, interface)

@@ -1,0 +1,177 @@
+"""Model descriptions in the cache folder: large ones take seconds to parse, at every construction.
+
+A file holds JSON behind a checksum. What is damaged, or was written by another version of this
+package, is as good as missing, and so is a folder that cannot be read or written.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import logging
+import math
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, fields, replace
+from itertools import chain, groupby, repeat
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Final
+
+import fmpy
+
+from fmugym.archive.description import Capabilities, ModelDescription, ModelExchange, Unit
+from fmugym.archive.variable import UNKNOWN, Interval, Variable
+from fmugym.caching import cache_folder, read_file, replace_file
+from fmugym.signals import ordinary
+
+__all__ = ["keep", "kept"]
+
+logger = logging.getLogger(__name__)
+
+_FOLDER: Final = "descriptions"
+_LARGEST: Final = 2**28
+"""Bytes that a file may have, and its text."""
+
+_COLUMNS: Final = tuple(
+    field.name
+    for field in fields(Variable)
+    if field.name not in {"array", "place", "driven", "bounds", "sampling", "interval", "shift"}
+)
+"""What is kept of each variable: what a model description says, but for the times of clocks."""
+
+_SIMPLE: Final = tuple(
+    field.name
+    for field in fields(ModelDescription)
+    if field.name
+    not in {"capabilities", "variables", "namesakes", "units", "model_exchange", "structure"}
+)
+
+
+def kept(key: str) -> ModelDescription | None:
+    """Read what was kept under a key; None if there is nothing, or nothing sound."""
+    try:
+        content = read_file(cache_folder(_FOLDER) / _name(key), _LARGEST)
+        digest, packed = content[:32], content[32:]
+        if hashlib.sha256(packed).digest() != digest:
+            return None
+        text = zlib.decompressobj().decompress(packed, _LARGEST)
+        return _description_of(json.loads(text))
+    except ordinary(Exception):  # whatever a file may hold
+        return None
+
+
+def keep(key: str, description: ModelDescription) -> None:
+    """Keep a model description under a key, as it was read."""
+    try:
+        packed = zlib.compress(json.dumps(_plain(description)).encode(), 1)
+        path = cache_folder(_FOLDER) / _name(key)
+        replace_file(path, hashlib.sha256(packed).digest() + packed)
+    except ordinary(OSError, RecursionError) as error:
+        logger.debug("the model description is not kept: %s", error)
+
+
+def _name(key: str) -> str:
+    return hashlib.sha256(f"{key} {_version()}".encode()).hexdigest()[:32]
+
+
+@functools.cache
+def _version() -> str:
+    """Identify the code that reads model descriptions.
+
+    Raises:
+        OSError: If its files cannot be read.
+    """
+    sources = sorted(Path(__file__).parent.glob("*.py"))
+    if not sources:
+        raise FileNotFoundError(f"{__file__} is in no folder")
+    digest = hashlib.sha256(fmpy.__version__.encode())
+    for source in sources:
+        digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+def _plain(description: ModelDescription) -> dict[str, Any]:
+    """Lists, dicts, texts and numbers from which ``_description_of`` makes it again."""
+    exchange = description.model_exchange
+    return {
+        "simple": [getattr(description, name) for name in _SIMPLE],
+        "capabilities": asdict(description.capabilities),
+        "units": {name: asdict(unit) for name, unit in description.units.items()},
+        "model_exchange": None if exchange is None else asdict(exchange),
+        "variables": _table(description.variables.values()),
+        "namesakes": [_table(several) for several in description.namesakes.values()],
+    }
+
+
+def _table(variables: Iterable[Variable]) -> dict[str, Any]:
+    """The columns of variables, and the times of the clocks among them by their rows."""
+    rows = list(variables)
+    clocks = {row: v for row, v in enumerate(rows) if v.ticking}
+    return {
+        "columns": [_runs_of(map(attrgetter(name), rows)) for name in _COLUMNS],
+        "times": {row: [v.interval, v.shift] for row, v in clocks.items()},
+    }
+
+
+def _runs_of(values: Iterable[Any]) -> list[list[Any]]:
+    """Equal neighbours once, and how many each are; no numbers where no neighbours are equal.
+
+    Most variables differ in little but the name.
+    """
+    groups = [list(group) for _, group in groupby(values, lambda one: one or repr(one))]
+    counts = list(map(len, groups))
+    return [[group[0] for group in groups], counts if any(n > 1 for n in counts) else []]
+
+
+def _values_of(values: list[Any], counts: list[int]) -> Iterable[Any]:
+    """What ``_runs_of`` has shortened."""
+    frozen = map(_frozen, values)
+    return chain.from_iterable(map(repeat, frozen, counts)) if counts else frozen
+
+
+def _description_of(plain: dict[str, Any]) -> ModelDescription:
+    exchange = plain["model_exchange"]
+    variables = _variables_of(plain["variables"])
+    namesakes = [tuple(_variables_of(table)) for table in plain["namesakes"]]
+    simple = dict(zip(_SIMPLE, map(_frozen, plain["simple"]), strict=True))
+    return ModelDescription(
+        **simple,
+        capabilities=Capabilities(**plain["capabilities"]),
+        variables={variable.name: variable for variable in variables},
+        namesakes={several[0].name: several for several in namesakes},
+        units={name: _unit_of(unit) for name, unit in plain["units"].items()},
+        model_exchange=None
+        if exchange is None
+        else ModelExchange(**{name: _frozen(value) for name, value in exchange.items()}),
+    )
+
+
+def _variables_of(table: dict[str, Any]) -> list[Variable]:
+    columns = [_values_of(*runs) for runs in table["columns"]]
+    rows = zip(*columns, strict=True)
+    variables = [Variable(**dict(zip(_COLUMNS, row, strict=True))) for row in rows]
+    for row, times in table["times"].items():
+        interval, shift = map(_time_of, times)
+        variables[int(row)] = replace(variables[int(row)], interval=interval, shift=shift)
+    return variables
+
+
+def _time_of(time: Sequence[Any]) -> Interval:
+    """A time of a clock. One that only the FMU knows is always the same object."""
+    made = Interval(*time)
+    return UNKNOWN if math.isnan(made.seconds) else made
+
+
+def _unit_of(unit: dict[str, Any]) -> Unit:
+    displays = {name: tuple(pair) for name, pair in unit["display_units"].items()}
+    dimension = unit["dimension"]
+    return Unit(
+        None if dimension is None else tuple(dimension), unit["factor"], unit["offset"], displays
+    )
+
+
+def _frozen(value: Any) -> Any:
+    """Tuples, which JSON has made lists."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
