@@ -60,6 +60,16 @@ DEFAULT_PROBE_TIMEOUT: Final = 60.0
 """Seconds that a call may take in the trial of an unknown FMU; for an initialization, ten times."""
 
 _NEVER_NEEDED: Final = {"documentation", "sources"}
+_NAMES: Final = {
+    "linux64": "x86_64-linux",
+    "linux32": "x86-linux",
+    "darwin64": "x86_64-darwin",
+    "win64": "x86_64-windows",
+    "win32": "x86-windows",
+}
+"""Of folders under ``binaries/`` until FMI 2.0, and in FMI 3.0."""
+
+_OTHER_NAMES: Final = {**_NAMES, **{new: old for old, new in _NAMES.items()}}
 _WINDOWS_32: Final = {"win32", "x86-windows"}
 _MOST_FINDINGS: Final = 20
 """Findings that the log repeats; ``FMU.findings`` has all."""
@@ -157,11 +167,22 @@ class FMU(KnownArguments):
 
     def _choose_library(self) -> str | None:
         """Find the library for this platform, or else one for Windows that can run here in Wine."""
-        places = list(self._archive.files)
-        if not _libraries_in(places, self.library) and can_run_windows():
+        wanted = self._wanted_library()
+        if wanted is None and can_run_windows():
             self.in_wine = True
-            self.in_wine = bool(_libraries_in(places, self.library))
-        return _find_library(places, self.library)
+            wanted = self._wanted_library()
+            self.in_wine = wanted is not None
+        return None if wanted is None else _find_library(list(self._archive.files), wanted)
+
+    def _wanted_library(self) -> str | None:
+        """The library's place in the folder for this machine, or in that of another FMI version.
+
+        None if neither has a library.
+        """
+        name, places = self.library.rpartition("/")[2], list(self._archive.files)
+        folders = (self.platform, _OTHER_NAMES.get(self.platform, self.platform))
+        there = (f"binaries/{folder}/{name}" for folder in folders)
+        return next((wanted for wanted in there if _libraries_in(places, wanted)), None)
 
     def _log_findings(self) -> None:
         if self.findings:
@@ -426,10 +447,9 @@ class FMU(KnownArguments):
 
     def _no_library(self) -> str:
         """Say which library is missing, and what there is instead."""
-        folder, _, name = self.library.rpartition("/")
-        there = [
-            p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), self.library)
-        ]
+        wanted = self._wanted_library() or self.library
+        folder, _, name = wanted.rpartition("/")
+        there = [p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), wanted)]
         if there:
             return (
                 f"{self.path.name} has {len(there)} libraries for this platform in {folder} "
@@ -478,7 +498,8 @@ class FMU(KnownArguments):
         if only and first != only:
             return False
         if first == "binaries":
-            return rest.partition("/")[0].casefold() == self.platform.casefold() and "/" in rest
+            used = (self._library_place or self.library).split("/")[1]
+            return rest.partition("/")[0].casefold() == used.casefold() and "/" in rest
         return first not in _NEVER_NEEDED
 
     def _target(self, place: str) -> str:

@@ -115,6 +115,27 @@ class TestNames:
         runs(path)
         assert f"{folder!r} in the archive is taken for 'binaries'" in findings(path)
 
+    @pytest.mark.parametrize("change", [str, str.upper, str.title])
+    @each_version
+    def test_folders_of_another_fmi_version(self, make, version, change):
+        """FMI 3.0 has other names for platforms; the folder of the version counts more."""
+        own, other = platform_folder(version), change(platform_folder(2 if version == 3 else 3))
+        path = make(version, lambda n: n.replace(f"/{own}/", f"/{other}/"))
+        runs(path)
+        assert f"the library is 'binaries/{other}/Probe{SUFFIX}', expected" in findings(path)
+        path = make(version, after=[(f"binaries/{other}/Probe{SUFFIX}", "no library")])
+        runs(path)
+        assert "the library is" not in findings(path)
+
+    def test_a_folder_of_another_fmi_version_with_several_libraries(self, make):
+        other = platform_folder(2)
+        path = make(
+            3,
+            lambda n: f"binaries/{other}/One{SUFFIX}" if n.endswith(SUFFIX) else n,
+            after=[(f"binaries/{other}/Two{SUFFIX}", "")],
+        )
+        require_refused(path, f"2 libraries for this platform in binaries/{other}")
+
     def test_colons(self, make):
         """They are fine on Unix; zipfile replaces them on Windows."""
         runs(make(after=[("resources/12:30.csv", "x")]))
