@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import secrets
 import shutil
+import sys
 import tempfile
 from pathlib import Path
 from typing import Final
@@ -14,10 +16,21 @@ from fmugym.caching import own_prefix, sweep
 from fmugym.errors import FMULoadError
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["folder_name", "make_folder", "remove_folder", "remove_rest"]
+__all__ = ["folder_name", "is_plain", "make_folder", "remove_folder", "remove_rest"]
 
 _made_in: Final[dict[Path, str]] = {}
 """The working directory at the time when each folder was made."""
+
+
+_PLAIN: Final = re.compile(r"[A-Za-z0-9_.~/\\:-]{1,150}")
+"""Paths that FMUs can be expected to cope with, ours of some 50 letters added."""
+
+_OTHER_ROOTS: Final = (
+    (os.environ.get("PUBLIC", ""), os.environ.get("PROGRAMDATA", ""))
+    if sys.platform == "win32"
+    else ("/tmp", "/var/tmp", "/dev/shm")
+)
+"""Where all users may make folders."""
 
 
 def folder_name() -> Path:
@@ -30,11 +43,34 @@ def folder_name() -> Path:
         FMULoadError: If the system has no folder for temporary files.
     """
     try:
-        root = Path(tempfile.gettempdir())
+        root = _root()
         sweep(root)
         return root / f"{own_prefix()}{secrets.token_hex(8)}"
     except ordinary(OSError) as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
+
+
+def _root() -> Path:
+    """The system's folder for temporary files; another one if its path could harm FMUs.
+
+    Many FMUs do not decode the URI of their resources, or have little room for paths.
+    """
+    usual = Path(tempfile.gettempdir())
+    others = _OTHER_ROOTS if not is_plain(usual) else ()
+    return next((Path(root) for root in others if _is_usable(root)), usual)
+
+
+def is_plain(path: Path) -> bool:
+    """Whether a path is short, and its URI has it as it is: no spaces, no special letters."""
+    return bool(_PLAIN.fullmatch(str(path)))
+
+
+def _is_usable(root: str) -> bool:
+    """Whether libraries can be extracted to a folder and loaded from there."""
+    if not os.path.isdir(root) or not os.access(root, os.W_OK | os.X_OK):
+        return False
+    mounted = os.statvfs(root).f_flag if hasattr(os, "statvfs") else 0
+    return is_plain(Path(root)) and not mounted & getattr(os, "ST_NOEXEC", 0)
 
 
 def make_folder(folder: Path) -> None:

@@ -147,7 +147,7 @@ class NativePool(AskingPool):
         try:
             return _native.Pool(form, arrays, Receiver(log, description))
         except ordinary(OSError) as error:
-            raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
+            raise FMULoadError(loading_failed(fmu.path.name, str(error), fmu.extract())) from None
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""

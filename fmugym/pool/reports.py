@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
+from fmugym.archive.temporary import is_plain
 from fmugym.archive.variable import Variable
 from fmugym.errors import printable
 from fmugym.fmi.status import failed_call
@@ -34,6 +36,11 @@ _LEVELS: Final = (
 )
 _NO_REFERENCE: Final = 2**32 - 1
 _DERIVATIVES: Final = "the derivative by", "the derivative of"
+_ADVICE: Final = (
+    "; it is in {}, which is long, or has spaces or special letters, and some FMUs do not find "
+    "their files there: set TMPDIR to a short path without such letters"
+)
+
 REFUSED_ANEW: Final = "the FMU refused to be instantiated anew"
 """How a failure of an instance begins that could not be made again; see ``native/instances.c``."""
 
@@ -90,10 +97,11 @@ def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
     return printable(", ".join(bad))
 
 
-def loading_failed(fmu: str, error: str) -> str:
-    """Say why an FMU of this name cannot be loaded, with what it said."""
+def loading_failed(fmu: str, error: str, folder: Path) -> str:
+    """Say why an FMU of this name cannot be loaded from a folder, with what it said."""
     reason, _, said = error.partition(_SAID)
-    return f"{fmu} cannot be loaded: {reason}{quoted(unpacked(said))}"
+    advice = "" if is_plain(folder) else _ADVICE.format(folder)
+    return f"{fmu} cannot be loaded: {reason}{quoted(unpacked(said))}{advice}"
 
 
 def as_log_record(name: str, status: int, category: str, message: str) -> tuple[int, str]:

@@ -469,7 +469,7 @@ class Supervisor:
                 self._setup.fmu.require_libraries(self._setup.folder)
         except FMULoadError as error:
             return str(error)
-        return loading_failed(self._name, text)
+        return loading_failed(self._name, text, self._setup.folder)
 
     def _receive(self, deadline: float, doing: str, read: Callable[[Reader], Any] | None) -> Any:
         while True:
