@@ -39,12 +39,19 @@ _WORDS: Final[Mapping[str, str]] = {
 """Words in names that tell such a quantity."""
 
 _SAID: Final[Mapping[str, str]] = {
-    "K": r"\bkelvin\b|[\[(]K[\])]|\bin K\b",
-    "degC": r"\bcelsius\b|\bdeg ?C\b|°C|[\[(]C[\])]",
-    "Pa": r"\bpascals?\b|[\[(]Pa[\])]|\bin Pa\b",
-    "%": r"\bper ?cent\b|%|\bpct\b",
+    "K": r"\b[Kk]elvin\b|[\[(]K[\])]|\bin K\b",
+    "degC": r"\b[Cc]elsius\b|\bdeg ?C\b|°C|[\[(]C[\])]",
+    "Pa": r"\b[Pp]ascals?\b|[\[(]Pa[\])]|\bin Pa\b",
+    "%": r"\b[Pp]er ?cent\b|%|\bpct\b",
 }
 """Units in descriptions."""
+
+_DESCRIBED: Final[Mapping[str, str]] = {
+    "K": r"\b[Tt]emperature\b",
+    "Pa": r"\b[Pp]ressure\b",
+    "%": r"\b[Hh]umidity\b",
+}
+"""Quantities in descriptions."""
 
 _USUAL: Final[Mapping[str, tuple[float, float]]] = {
     "K": (200.0, 500.0),
@@ -64,13 +71,34 @@ _CANDIDATES: Final = (
 
 
 def likely_units(description: ModelDescription) -> dict[str, str]:
-    """Units of inputs, outputs and locals without one, by name: by what the description says."""
-    found = {
-        variable.name: likely_unit(variable)
-        for variable in description.variables.values()
-        if variable.causality in {"input", "output", "local"}
-    }
-    return {name: unit for name, unit in found.items() if unit is not None}
+    """Units of inputs, outputs and locals without one, by name: by what the description says.
+
+    A temperature without a start value is in kelvin where others of the FMU are.
+    """
+    variables = [v for v in description.variables.values() if v.unit is None]
+    found = {variable.name: likely_unit(variable) for variable in variables}
+    if "K" in found.values() and not any(map(_is_of_celsius, variables)):
+        found |= {v.name: "K" for v in variables if _may_be_kelvin(v)}
+    used = {v.name for v in variables if v.causality in {"input", "output", "local"}}
+    return {name: unit for name, unit in found.items() if unit is not None and name in used}
+
+
+def _may_be_kelvin(variable: Variable) -> bool:
+    """Whether a variable is a temperature by its name or description, and has no start value."""
+    is_number = variable.kind == "real" and not variable.relative
+    is_number &= not variable.name.rpartition(".")[2].startswith("der")
+    is_open = not _start_values(variable) and _said(variable) in (None, "K")
+    return is_number and is_open and _is_called(variable, "K", None)
+
+
+def _is_of_celsius(variable: Variable) -> bool:
+    """Whether a temperature starts as one in degrees Celsius does."""
+    starts = _start_values(variable)
+    is_usual = any(0.0 < abs(value) < _MOST_CELSIUS for value in starts)
+    return is_usual and variable.kind == "real" and _is_called(variable, "K", None)
+
+
+_MOST_CELSIUS: Final = 100.0
 
 
 def likely_unit(
@@ -89,15 +117,23 @@ def likely_unit(
     if variable.unit is not None or variable.kind != "real" or variable.relative:
         return None
     known = list(values) or _start_values(variable)
-    for unit, pattern in _SAID.items():
-        if re.search(pattern, variable.description, re.IGNORECASE if len(unit) > 1 else 0):
-            return unit if unit == "degC" or _is_usual(unit, known, default=True) else None
+    said = _said(variable)
+    if said is not None:
+        return said if said == "degC" or _is_usual(said, known, default=True) else None
     if not known:
         return None
     for unit in _UNITS:
         if _is_called(variable, unit, wanted) and _is_usual(unit, known, default=False):
             return unit
     return "K" if all(map(_is_from_celsius, known)) else None
+
+
+def _said(variable: Variable) -> str | None:
+    """The unit that the description tells."""
+    for unit, pattern in _SAID.items():
+        if re.search(pattern, variable.description):
+            return unit
+    return None
 
 
 def _start_values(variable: Variable) -> list[float]:
@@ -111,6 +147,8 @@ def _start_values(variable: Variable) -> list[float]:
 def _is_called(variable: Variable, unit: str, wanted: str | None) -> bool:
     if wanted is not None:
         return wanted in _UNITS[unit]
+    if re.search(_DESCRIBED[unit], variable.description):
+        return True
     last = variable.name.rpartition(".")[2]
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", last)
     words += [word.lower() for word in words if len(word) > 1]  # T is not t, p is not P
@@ -195,12 +233,14 @@ class Misreading:
         text: What tells it.
         line: What to write in ``[variables]``.
         contradicts: Whether its values contradict its limits in the task.
+        is_converted: Whether the task takes it for a unit.
     """
 
     name: str
     text: str
     line: str
     contradicts: bool = False
+    is_converted: bool = True
 
 
 def misreadings(env: Any, seen: Mapping[str, Sequence[float]]) -> Iterator[Misreading]:
@@ -219,8 +259,10 @@ def misreadings(env: Any, seen: Mapping[str, Sequence[float]]) -> Iterator[Misre
         values = seen.get(quantity.name, ()) if quantity.kind == "output" else ()
         has_limits = not declared.keys().isdisjoint({"min", "max"})
         line = f"{quantity.name} = {{ {'..., ' if declared else ''}fmu_unit = {{}} }}"
-        found = _contradiction(env, quantity, variable, values, line) if has_limits else None
-        found = found or _surprise(quantity.name, variable, values, declared.get("unit"), line)
+        unit, found = declared.get("unit"), None
+        if has_limits:
+            found = _contradiction(env, quantity, variable, values, unit, line)
+        found = found or _surprise(quantity.name, variable, values, unit, line)
         if found is not None:
             yield found
     for name, entry in (env.task.document.get("data") or {}).items():
@@ -264,18 +306,23 @@ def _without_unit(env: Any, name: str) -> Variable | None:
 
 
 def _contradiction(
-    env: Any, quantity: Quantity, variable: Variable, values: Sequence[float], line: str
+    env: Any,
+    quantity: Quantity,
+    variable: Variable,
+    values: Sequence[float],
+    wanted: str | None,
+    line: str,
 ) -> Misreading | None:
     """Values of an output that are outside of its limits, but would not be in another unit."""
-    if not values or not quantity.unit:
+    if not values or wanted is None:
         return None
     seen, limits = (min(values), max(values)), (quantity.low, quantity.high)
-    unit = unit_within(variable, quantity.unit, limits, seen, env.fmu.description.units)
+    unit = unit_within(variable, wanted, limits, seen, env.fmu.description.units)
     if unit is None:
         return None
     text = (
         f"{quantity.name} is {seen[0]:.4g} to {seen[1]:.4g}, outside of its limits "
-        f"{limits[0]:g} and {limits[1]:g} {quantity.unit}; it is within them if the FMU, which "
+        f"{limits[0]:g} and {limits[1]:g} {wanted}; it is within them if the FMU, which "
         f"gives no unit, means {unit}"
     )
     return Misreading(quantity.name, text, _filled(line, unit), contradicts=True)
@@ -292,7 +339,7 @@ def _surprise(
     ends = f"{min(known):.4g} to {max(known):.4g}" if known else variable.description
     taken = "" if wanted is None else f"; the task takes it for {wanted}"
     text = f"{name} ({ends}) looks like {unit}, but the FMU gives it no unit{taken}"
-    return Misreading(name, text, _filled(line, unit))
+    return Misreading(name, text, _filled(line, unit), is_converted=wanted is not None)
 
 
 def _filled(line: str, unit: str) -> str:

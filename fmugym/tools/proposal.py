@@ -52,6 +52,9 @@ _UNITS_OF_RESULTS: Final = _TEMPERATURES | {"W", "kW", "MW", "J", "kJ", "Wh", "k
 _DEGREES: Final = 5.0
 """A set point of a temperature is this near to its start; zero of its unit means nothing."""
 
+_ROOM: Final = {"K": 293.15, "degC": 20.0, "degF": 68.0}
+"""What a temperature without a start is controlled to."""
+
 _GOAL: Final = re.compile(
     r"level|height|position|angle|speed|veloc|omega|rpm|pressure"
     r"|(^|\.)[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
@@ -154,8 +157,8 @@ class Proposal:
                 f"the FMU gives no limits of {variable.causality} {variable.name!r}: those in the "
                 "file are a guess"
             )
-        used = {*map(_scalar_or_array, [*self._actions, *self._skeleton.outputs])}
-        for name in used & self._guessed.keys():
+        used = dict.fromkeys(map(_scalar_or_array, [*self._actions, *self._skeleton.outputs]))
+        for name in (one for one in used if one in self._guessed):
             yield (
                 f"the FMU gives no unit of {name!r}, which looks like {self._guessed[name]}: check "
                 "'fmu_unit'"
@@ -344,7 +347,7 @@ def _unlikeliness(variable: Variable) -> tuple[bool, ...]:
 
 def _ends_of_setpoint(variable: Variable) -> tuple[float, float]:
     """Values near the start of a temperature, or in the middle of the range of another output."""
-    start = start_value(variable) or variable.nominal
+    start = start_value(variable) or variable.nominal or _ROOM.get(variable.unit or "")
     if variable.unit in _TEMPERATURES and isinstance(start, int | float):
         return start - _DEGREES, start + _DEGREES
     low, high = guessed_bounds(variable)

@@ -451,7 +451,8 @@ def _misread(env: FMUEnv) -> list[Misreading]:
 def _of_units(misread: Sequence[Misreading]) -> Iterator[Finding]:
     """Tell what the FMU seems to mean by numbers to which it gives no unit."""
     for one in misread:
-        verdict = "error" if one.contradicts else "warning"
+        verdict = "warning" if one.is_converted else "ok"
+        verdict = "error" if one.contradicts else verdict
         yield Finding(verdict, "units", one.text, f"write {one.line} under [variables]")
 
 

@@ -336,10 +336,32 @@ class TestValidate:
         report = self.report(path, T=declared | {"fmu_unit": "K"})
         assert not [one for one in report.findings if one.check == "units"]
 
+    @pytest.mark.parametrize(
+        ("name", "declared", "unit"),
+        [
+            ("T_op", {"unit": "degC", "min": 10}, None),
+            ("T_op", {"unit": "degC", "max": 60}, "K"),
+            ("T_op", {"unit": "degF", "min": 40, "max": 110}, "K"),
+            ("T_out", {"unit": "1", "min": 0, "max": 10}, "%"),
+            ("P", {"unit": "kW", "min": 0, "max": 10}, "W"),
+            ("E", {"unit": "kWh", "min": 0, "max": 200}, "J"),
+        ],
+    )
+    def test_of_other_quantities(self, tmp_path, name, declared, unit):
+        """A start temperature of 278 stands for a number of per cent here."""
+        report = self.report(without_units(tmp_path), seen=declared | {"name": name})
+        errors = [one for one in report.findings if one.verdict == "error"]
+        assert [f'fmu_unit = "{unit}"' in one.cure for one in errors] == [True] * bool(unit)
+
     def test_proposes_a_unit_of_what_looks_like_kelvin(self, tmp_path):
         report = self.report(without_units(tmp_path), T={"name": "T_op", "unit": "degC"})
         (found,) = [one for one in report.findings if one.check == "units"]
         assert (found.verdict, 'fmu_unit = "K"' in found.cure) == ("warning", True)
+
+    def test_proposes_a_unit_where_the_task_has_none(self, tmp_path):
+        report = self.report(without_units(tmp_path), T={"name": "T_op"})
+        (found,) = [one for one in report.findings if one.check == "units"]
+        assert (found.verdict, 'fmu_unit = "K"' in found.cure) == ("ok", True)
 
     def test_says_nothing_of_limits_that_fit(self, tmp_path):
         declared = {"name": "T_op", "min": 280, "max": 320, "unit": "K"}
@@ -401,6 +423,19 @@ class TestNew:
         }
         text = Proposal(fmugym.FMU(edited_fmu("House", tmp_path, edits))).text()
         assert tomllib.loads(text)["variables"]["T_op"] == {"fmu_unit": "K"}
+
+    def test_a_temperature_without_a_start_is_like_others(self, tmp_path):
+        """As exporters write outputs: they are calculated."""
+        fmu = fmugym.FMU(without_units(tmp_path))
+        variables = tomllib.loads(Proposal(fmu).text())["variables"]
+        assert {name for name, one in variables.items() if one.get("fmu_unit") == "K"} == {
+            *("T_air", "T_op", "T_m", "T_w")
+        }
+        edits = {'start="293.15"': 'start="20"'}
+        (tmp_path / "degC").mkdir()
+        other = fmugym.FMU(edited_fmu(fmu.path, tmp_path / "degC", edits))
+        variables = tomllib.loads(Proposal(other).text())["variables"]
+        assert not any("fmu_unit" in variables.get(name, {}) for name in ("T_air", "T_op"))
 
     def test_proposes_none_where_the_fmu_has_units(self):
         assert "fmu_unit" not in Proposal(fmugym.FMU(fmugym.bundled_fmu("House"))).text()
