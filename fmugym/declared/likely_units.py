@@ -279,12 +279,12 @@ def require_units(env: Any) -> None:
     """Refuse a task whose outputs at the start of an episode contradict their limits.
 
     Args:
-        env: An environment, which is reset.
+        env: An environment; it is reset if the FMU leaves the unit of such an output open.
 
     Raises:
         ConfigError: If another unit of the FMU would explain it; the text says which.
     """
-    if getattr(env, "task", None) is None:
+    if getattr(env, "task", None) is None or not any(_open_names(env)):
         return
     env.reset(seed=0)
     quantities = env.inside.quantities()
@@ -294,6 +294,14 @@ def require_units(env: Any) -> None:
     for one in misreadings(env, seen):
         if one.contradicts:
             raise ConfigError(f"{one.text}: write {one.line} under [variables]")
+
+
+def _open_names(env: Any) -> Iterator[str]:
+    """The names of variables with a unit and limits in the task, and no unit in the FMU."""
+    for name, declared in (env.task.document.get("variables") or {}).items():
+        has_limits = "unit" in declared and not declared.keys().isdisjoint({"min", "max"})
+        if has_limits and _without_unit(env, declared.get("name", name)) is not None:
+            yield name
 
 
 _KINDS: Final = ("action", "input", "output", "parameter")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from fmugym.archive.units import conversion_between
 from fmugym.declared.entries import Entry
 from fmugym.declared.series import read_rows
 from fmugym.errors import ConfigError, shown
+from fmugym.logs import declared_as
 from fmugym.plant.tags import DATA, Plant
 from fmugym.pool.base import FloatArray
 
@@ -44,6 +45,7 @@ class Live:
         self._past: dict[str, list[tuple[float, float]]] = {name: [] for name in self._entries}
         self._require_tags()
         self._units = envs[0].fmu.description.units
+        self._relative = set(_relative(envs[0], self._past))
         self._own = {name: root.child("data").child(name).value.get("unit") for name in self._past}
 
     def _require_tags(self) -> None:
@@ -87,8 +89,9 @@ class Live:
             values = np.array(tags[DATA + name])
             return now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values
         times, values = read_rows(entry)
-        unit: Any = conversion_between(entry.value.get("unit"), self._own[name], self._units)
-        values = unit(values)
+        given, own = entry.value.get("unit"), self._own[name]
+        unit: Any = conversion_between(given, own, self._units)
+        values = unit.of_differences(name in self._relative)(values)
         holds = entry.value["interpolation"] == "previous"
         end = times[-1] + (times[-1] - times[-2] if holds and len(times) > 1 else 0.0)
         ahead = self._ahead[name]
@@ -117,6 +120,15 @@ class Live:
 def forecasts(root: Entry, name: str) -> list[Any]:
     """The forecasts in which the agent sees some data."""
     return [one for one in root.child("agent").child("forecast").value or () if name in one["of"]]
+
+
+def _relative(env: Any, names: Iterable[str]) -> Iterator[str]:
+    """The data that an input gets which is a difference, whose unit has no offset."""
+    for name in names:
+        to = env.task.root.child("data").child(name).value.get("input")
+        variable = env.fmu.description.find(declared_as(env, to)[0]) if to else None
+        if variable is not None and variable.relative:
+            yield name
 
 
 def horizon(root: Entry, name: str) -> float:

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from gymnasium import spaces
 
+from fmugym.declared.likely_units import require_units
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import (
     HELD_OUT_SEED,
@@ -180,6 +181,8 @@ def train(
     else:
         require_new(settings.folder)
         _check_arguments(settings)
+        with closing(settings.make_env()) as env:
+            require_units(env.unwrapped)
     wrap = _recorder(settings, resume)
     venv = sb3.make_sb3_env(settings.make_env, settings.num_envs, seed=settings.seed, wrap=wrap)
     try:

@@ -22,9 +22,11 @@ from fmugym.declared.likely_units import likely_unit, unit_within
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.fit import fit_logs
 from fmugym.logs import PlantLog
+from fmugym.plant.tags import read_plant
 from fmugym.search.probe import Probe
 from fmugym.tools.proposal import Proposal
 from fmugym.tools.validation import validate
+from fmugym.training.training import TrainingSettings, train
 
 UNITS = {
     "T": {"fmu_unit": "K"},
@@ -144,6 +146,24 @@ class TestConversion:
         ]
         assert 291 <= values[0]["T_m_0"] <= 298
         assert values[0] == pytest.approx(values[1])
+
+    def test_of_tags_of_a_plant(self, tmp_path):
+        plant = {
+            "address": "127.0.0.1:502",
+            "protocol": "modbus",
+            "tags": {
+                "T": {"register": 0, "type": "float64", "unit": "K"},
+                "power": {"register": 4, "type": "float64", "unit": "W"},
+            },
+        }
+        with house(without_units(tmp_path), variables=UNITS, plant=plant) as env:
+            own = read_plant(env).tags
+        with house(plant=plant) as env:
+            other = read_plant(env).tags
+        assert own.keys() == {"T", "power"}
+        for name, tag in own.items():
+            assert tag.conversion(300.0) == pytest.approx(other[name].conversion(300.0))
+            assert tag.to_task(300.0) == pytest.approx(other[name].to_task(300.0))
 
     @pytest.mark.parametrize("given", [500.0, [500.0, 250.0]])
     def test_of_an_array_at_the_start(self, tmp_path, given):
@@ -384,7 +404,7 @@ class TestValidate:
         findings = validate(lambda: fmugym.load(task)).findings
         assert {one.verdict for one in findings if one.check == "units"} == {"warning"}
 
-    def test_of_a_search_too(self, tmp_path):
+    def test_refuses_trainings_too(self, tmp_path):
         declared = {"name": "T_op", "unit": "degC", "min": 10, "max": 40}
         task = {
             "fmu": str(without_units(tmp_path)),
@@ -396,6 +416,10 @@ class TestValidate:
         }
         with pytest.raises(fmugym.ConfigError, match='fmu_unit = "K"'):
             Probe.of(lambda: fmugym.load(task), 2, print)
+        settings = TrainingSettings(lambda: fmugym.load(task), {}, tmp_path / "agent", steps=5000)
+        with pytest.raises(fmugym.ConfigError, match='fmu_unit = "K"'):
+            train(settings)
+        assert not (tmp_path / "agent").exists()
 
 
 class TestNew:
