@@ -12,7 +12,7 @@ from typing import Final
 
 from fmugym.errors import printable
 
-__all__ = ["Message", "as_messages", "quoted", "telling", "unpacked"]
+__all__ = ["Message", "as_messages", "asked_for", "quoted", "telling", "unpacked"]
 
 Message = tuple[int, str]
 """An FMI status, ``UNKNOWN`` for a line of output, and a text."""
@@ -32,6 +32,27 @@ _SOUNDS_BAD: Final = re.compile(
 )
 _EMPTY_NAME: Final = re.compile(r"^\W*(?:[\w.]+\.)?Exception: *(?=\S)")
 """The name of the exception type that says nothing."""
+
+_LACKS: Final = re.compile(
+    r"\bneed|\brequir|\bmust\b|\bmissing\b|\bmandatory\b|\bexpect|\black|\bha(s|ve) to\b"
+    r"|\bshould\b|\bplease\b|\bundefined\b|\bunset\b|\bunspecified\b|\bwithout\b"
+    r"|\bnot? (been |yet )?(set|defined|given|specified|provided|known|available|passed)\b"
+    r"|\bno (\w+ )?(stop|end|final|tolerance|rtol|step|communication)",
+    re.IGNORECASE,
+)
+"""How FMUs ask for something."""
+
+_REACHED: Final = re.compile(r"exceed|beyond|\bpast\b|greater|larger|later|reached", re.IGNORECASE)
+"""What is told of a time or tolerance that was given."""
+
+_KEYS: Final = {
+    "stop_time": re.compile(r"\b(stop|end|final)[ _-]?time|\btstop\b", re.IGNORECASE),
+    "tolerance": re.compile(r"\btoleran|\brtol\b", re.IGNORECASE),
+    "time_step": re.compile(
+        r"step[ _-]?(size|length)|\btime[ _-]?step|\bsample[ _-]?time", re.IGNORECASE
+    ),
+}
+"""What an FMU may ask for, by the key of a config that gives it."""
 
 _END: Final = "\x1e"
 """Ends a message in the texts of ``fmugym._native``; see ``native/log.h``."""
@@ -63,10 +84,24 @@ def telling(messages: Sequence[Message]) -> list[str]:
     return list(lines)[-_MOST:]
 
 
+def asked_for(text: str) -> str:
+    """The key of a config that gives what an FMU asks for in a text; "" if there is none."""
+    if not _LACKS.search(text):
+        return ""
+    is_given = _REACHED.search(text)
+    found = (key for key, pattern in _KEYS.items() if pattern.search(text))
+    return next((key for key in found if key == "time_step" or not is_given), "")
+
+
 def quoted(messages: Sequence[Message], speaker: str = "the FMU said") -> str:
-    """Quote the telling messages, to end an error's text; "" if there are none."""
+    """Quote the telling messages, to end an error's text; "" if there are none.
+
+    What the FMU asks for follows by the name of its key.
+    """
     lines = telling(messages)
-    return f"; {speaker}: {' | '.join(lines)}" if lines else ""
+    keys = dict.fromkeys(filter(None, map(asked_for, lines)))
+    cure = f"; cure: set {' and '.join(keys)} in the config" if keys else ""
+    return f"; {speaker}: {' | '.join(lines)}{cure}" if lines else ""
 
 
 def _line(text: str) -> str:

@@ -25,7 +25,14 @@ from fmugym.repair.stand_in import replaceable
 from fmugym.search.guessing import both_controllers
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
-from fmugym.tools.skeleton import Skeleton, given_start, guessed_bounds, needs_bounds, remark
+from fmugym.tools.skeleton import (
+    END_OF_EXPERIMENT,
+    Skeleton,
+    given_start,
+    guessed_bounds,
+    needs_bounds,
+    remark,
+)
 
 __all__ = ["Proposal", "preload_line"]
 
@@ -189,7 +196,7 @@ class Proposal:
             [
                 *(head, *self._variables(), *self._results(), "", *self._setpoints(), ""),
                 *(*self._agent(), "", *self._controllers(), ""),
-                *(*self._parameters(), *self._config(), ""),
+                *(*self._parameters(), *self._config(), *self._foreign(), ""),
             ]
         )
 
@@ -291,6 +298,11 @@ class Proposal:
             yield f"# {self._skeleton.left_out} more are listed by: fmugym info"
 
     def _config(self) -> Iterator[str]:
+        if self._skeleton.stop_time is not None:
+            yield "\n[config]"
+            yield f"stop_time = {self._skeleton.stop_time!r}  # s, {END_OF_EXPERIMENT}"
+
+    def _foreign(self) -> Iterator[str]:
         """The old libraries that the FMU lacks; a comment until they are built."""
         names: tuple[str, ...] = ()
         if not isinstance(self._fmu.description, SystemDescription):

@@ -22,7 +22,15 @@ from fmugym.errors import ConfigError, plain
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 
-__all__ = ["Skeleton", "given_start", "guessed_bounds", "needs_bounds", "remark", "rounded_down"]
+__all__ = [
+    "END_OF_EXPERIMENT",
+    "Skeleton",
+    "given_start",
+    "guessed_bounds",
+    "needs_bounds",
+    "remark",
+    "rounded_down",
+]
 
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
@@ -52,6 +60,7 @@ _SOLVER: Final = re.compile(
 )
 """Names of parameters that set up the exporter's solver rather than the model."""
 
+END_OF_EXPERIMENT: Final = "that of the FMU's default experiment; an episode ends there"
 _NO_STEP_SIZE: Final = "TODO: the FMU gives none that fits"
 
 _PROGRAM: Final = '''\
@@ -229,6 +238,8 @@ class Skeleton:
         note = "the default of the FMU" if self.has_step_size else _NO_STEP_SIZE
         yield f'"time_step": {self.time_step!r},  # s, {note}'
         yield f'"max_episode_steps": {self.episode_steps},'
+        if self.stop_time is not None:
+            yield f'"stop_time": {self.stop_time!r},  # s, {END_OF_EXPERIMENT}'
 
     @property
     def time_step(self) -> float:
@@ -240,6 +251,16 @@ class Skeleton:
     def episode_steps(self) -> int:
         """As many steps as the default experiment has, unless that is no episode."""
         return round(self._duration / self.time_step) if self.has_duration else 200
+
+    @property
+    def stop_time(self) -> float | None:
+        """Where the FMU's default experiment ends; None where it gives no end, or one too early.
+
+        Some FMUs do not start without one.
+        """
+        start, stop = self._description.start_time, self._description.stop_time
+        length = self.episode_steps * self.time_step
+        return stop if stop is not None and start + length <= stop * (1 + 1e-9) else None
 
     @property
     def _duration(self) -> float:

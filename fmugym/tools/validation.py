@@ -25,6 +25,7 @@ from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
+from fmugym.fmi.words import asked_for
 from fmugym.series.choice import quantities_of
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
@@ -235,6 +236,8 @@ def _of_faults(first: _Episode) -> Finding:
     cure = "narrow the limits of the actions, shorten the time step, or use more substeps"
     if "the reward" in first.fault or "_reward_policy" in first.fault:
         cure = "look for a division by 0, a logarithm, a root or a power in the reward"
+    elif key := asked_for(first.fault):
+        cure = f"set {key} in the config"
     text = f"step {steps} of random actions failed: {first.fault}"
     return Finding("error", "run", text, cure)
 

@@ -170,6 +170,16 @@ static int set_up(Probe *me, double start, bool stop_defined, double stop, bool 
                   double tolerance) {
     int status = require(me, BEFORE_SETUP);
     me->phase = status == OK ? SET_UP : me->phase;
+#ifdef DEMANDS /* a condition under which it says DEMANDED */
+    if (DEMANDS) {
+#if FMI_VERSION == 3
+        ((Logger)me->logger)(me->environment, ERROR, "error", DEMANDED);
+#else
+        ((Logger)me->logger)(me->environment, me->name, ERROR, "error", DEMANDED);
+#endif
+        status = ERROR;
+    }
+#endif
     TIME = start;
     STOP_TIME = stop_defined ? stop : -1;
     TOLERANCE = tolerance_defined ? tolerance : -1;

@@ -148,9 +148,9 @@ def probe_xml(version):
     return _tag("fmiModelDescription", _head(version), inside)
 
 
-def probe_library(version):
-    """The compiled probe."""
-    return building.library("sources/probe.c", flags=(f"-DFMI_VERSION={version}",))
+def probe_library(version, *flags):
+    """The compiled probe, by more arguments of the compiler."""
+    return building.library("sources/probe.c", flags=(f"-DFMI_VERSION={version}", *flags))
 
 
 def stubs(version, prefix, source, made=()):
