@@ -15,6 +15,7 @@ from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison
+from fmugym.identification.clock_shift import Shift, shift_of_clocks
 from fmugym.logs import PlantLog
 from fmugym.tools.datasets import renaming
 from fmugym.tools.options import (
@@ -32,6 +33,8 @@ from fmugym.tools.overview import finite_or_none
 from fmugym.tools.targets import maker_of
 
 __all__ = ["add_fit"]
+
+_EVALUATIONS: Final = 100
 
 _RELATED: Final = 0.95
 """Correlations of parameters above this are worth a line."""
@@ -146,9 +149,21 @@ def _start(text: str) -> tuple[str, str | None]:
 
 
 def _show(fit: FitResult, arguments: argparse.Namespace) -> None:
-    say_result(arguments, _facts(fit), "\n".join(_table(fit)))
-    for one in _warnings(fit):
+    is_noise = all(one.is_noise for one in fit.correlations.values())
+    shift = None if is_noise else shift_of_clocks(fit, fit.comparison.trajectories, _EVALUATIONS)
+    facts = _facts(fit) | {"shift": None if shift is None else shift._asdict()}
+    say_result(arguments, facts, "\n".join(_table(fit)))
+    for one in ([] if shift is None else [_told(shift)]) + _warnings(fit, shift is not None):
         note(one)
+
+
+def _told(shift: Shift) -> str:
+    when = "later" if shift.seconds > 0 else "earlier"
+    return (
+        f"the outputs are logged {abs(shift.seconds):.3g} s {when} than the inputs: without that, "
+        f"residuals are {shift.improvement:.2g} times smaller. Their clocks differ, or something "
+        "delays the signals: change the times of one of them, and fit again"
+    )
 
 
 def _facts(fit: FitResult) -> dict[str, Any]:
@@ -195,11 +210,11 @@ def _table(fit: FitResult) -> list[str]:
     return [*aligned(rows), "", *aligned(outputs)]
 
 
-def _warnings(fit: FitResult) -> list[str]:
+def _warnings(fit: FitResult, has_shift: bool) -> list[str]:
     """What a reader of the table must know."""
     found = []
     for name, one in fit.correlations.items():
-        if not one.is_noise:
+        if not one.is_noise and not has_shift:
             found.append(
                 f"the residuals of {name} are no noise (autocorrelation {one.first:.2f}): the "
                 "structure of the model is not that of the plant. Standard errors allow for the "
