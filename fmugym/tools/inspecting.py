@@ -152,11 +152,9 @@ def add_new(commands: Commands) -> None:
 
 def _new(arguments: argparse.Namespace) -> None:
     model, output = open_model(arguments.fmu), arguments.output
-    made: Skeleton | Proposal = (
-        Skeleton(model)
-        if arguments.as_class
-        else Proposal(model, None if output is None else output.parent)
-    )
+    folder = None if output is None else output.parent
+    make = Skeleton if arguments.as_class else Proposal
+    made: Skeleton | Proposal = make(model, folder)
     text, notes, has_schema = made.text(), list(made.notes()), output and not arguments.as_class
     if has_schema:
         text = f"{_SCHEMA_LINE}{text}"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -20,10 +19,8 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
 from fmugym.declared.likely_units import likely_units
-from fmugym.errors import ConfigError, FMULoadError, plain
-from fmugym.repair.stand_in import replaceable
+from fmugym.errors import ConfigError, plain
 from fmugym.search.guessing import both_controllers
-from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 from fmugym.tools.skeleton import (
     END_OF_EXPERIMENT,
@@ -31,6 +28,7 @@ from fmugym.tools.skeleton import (
     given_start,
     guessed_bounds,
     needs_bounds,
+    old_libraries,
     remark,
 )
 
@@ -304,10 +302,7 @@ class Proposal:
 
     def _foreign(self) -> Iterator[str]:
         """The old libraries that the FMU lacks; a comment until they are built."""
-        names: tuple[str, ...] = ()
-        if not isinstance(self._fmu.description, SystemDescription):
-            with suppress(FMULoadError):  # the notes tell what is damaged
-                names = replaceable(self._fmu)
+        names = old_libraries(self._fmu)
         if not names:
             return
         are_there = all(((self._folder or Path()) / name).exists() for name in names)

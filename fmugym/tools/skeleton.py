@@ -7,18 +7,21 @@ comments of one line, so that none of them can become code.
 from __future__ import annotations
 
 import math
+import os
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
-from fmugym.errors import ConfigError, plain
+from fmugym.errors import ConfigError, FMULoadError, plain
+from fmugym.repair.stand_in import replaceable
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 
@@ -28,6 +31,7 @@ __all__ = [
     "given_start",
     "guessed_bounds",
     "needs_bounds",
+    "old_libraries",
     "remark",
     "rounded_down",
 ]
@@ -124,13 +128,14 @@ class Skeleton:
 
     Args:
         fmu: The FMU; nothing of it is executed.
+        folder: The folder of the file, from which paths are relative; None for absolute ones.
 
     Raises:
         ConfigError: If the FMU has no numeric variable to observe.
     """
 
-    def __init__(self, fmu: FMU) -> None:
-        self._fmu = fmu
+    def __init__(self, fmu: FMU, folder: Path | None = None) -> None:
+        self._fmu, self._folder = fmu, folder
         self._description = fmu.description
         if not self.outputs:
             raise ConfigError(
@@ -204,7 +209,7 @@ class Skeleton:
         return _PROGRAM.format(
             file=re.sub(r'["\\]', "_", plain(self._fmu.path.name)),
             import_="" if self.inputs else _IMPORT_WITHOUT_INPUT,
-            path=_quoted(self._fmu.path.as_posix()),
+            path=_quoted(self._path()),
             name=self.class_name,
             base=self._base,
             config=textwrap.indent("\n".join(self._config()), " " * 12),
@@ -219,6 +224,25 @@ class Skeleton:
         yield "# A value may be a distribution, drawn at each reset: fmugym.Uniform(low, high), ..."
         yield from _listing("model_parameters", list(self._parameter_lines()), "{}")
         yield from self._times()
+        yield from self._preloaded()
+
+    def _path(self) -> str:
+        """The path of the FMU, relative to the folder of the file if that is known."""
+        path = self._fmu.path
+        if self._folder is not None:
+            with suppress(ValueError):  # on another drive
+                path = Path(os.path.relpath(path, self._folder.absolute()))
+        return path.as_posix()
+
+    def _preloaded(self) -> Iterator[str]:
+        """The old libraries that the FMU lacks; a comment until they are built."""
+        names = old_libraries(self._fmu)
+        if names:
+            are_there = all(((self._folder or Path()) / name).exists() for name in names)
+            paths = ", ".join(_quoted(f"./{name}") for name in names)
+            name = plain(self._fmu.path.name)
+            yield f"# The FMU needs this: fmugym info --repair {name} builds it"
+            yield ("" if are_there else "# ") + f'"foreign": {{"preload": [{paths}]}},'
 
     def _bounds(self) -> Iterator[str]:
         unbounded = [v for v in self.inputs if needs_bounds(v)]
@@ -289,6 +313,14 @@ class Skeleton:
         if internal:
             return internal * max(1, round(self._duration / STEPS / internal))
         return rounded_down(self._duration / STEPS)
+
+
+def old_libraries(fmu: FMU) -> tuple[str, ...]:
+    """The libraries that an FMU lacks and for which replacements can be built."""
+    if not isinstance(fmu.description, SystemDescription):
+        with suppress(FMULoadError):  # the notes tell what is damaged
+            return replaceable(fmu)
+    return ()
 
 
 def _listing(key: str, lines: list[str], brackets: str = "[]") -> Iterator[str]:

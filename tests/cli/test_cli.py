@@ -226,6 +226,29 @@ class TestSkeleton:
         assert '"body": "point_mass",' in text
         assert '"bounds"' not in text  # the FMU has limits for its input
 
+    def test_paths_are_relative_to_the_file(self, ran, tmp_path):
+        for place, path in (("model.fmu", "model.fmu"), ("beside.fmu", "../beside.fmu")):
+            folder = tmp_path / "mine"
+            folder.mkdir(exist_ok=True)
+            fmu = (folder if "/" not in path else tmp_path) / place
+            fmu.write_bytes(fmugym.bundled_fmu("Pendulum").read_bytes())
+            file = folder / f"{fmu.stem}.py"
+            ran("new", "--class", fmu, "--output", file)
+            assert f'FMU_PATH = "{path}"' in file.read_text()
+            done = run_python(file.name, cwd=folder, timeout=300)
+            assert done.returncode == 0, done.stderr
+
+    def test_libraries_that_it_lacks_are_preloaded(self, ran, tmp_path, monkeypatch):
+        name = "libgfortran.so.3"
+        monkeypatch.setattr("fmugym.tools.skeleton.replaceable", lambda fmu: (name,))
+        line = f'"foreign": {{"preload": ["./{name}"]}},'
+        for is_there in (False, True):
+            if is_there:
+                (tmp_path / name).write_bytes(b"")
+            file = tmp_path / f"env_{is_there}.py"
+            ran("new", "--class", fmugym.bundled_fmu("Pendulum"), "--output", file)
+            assert f"{' ' * 12}{'' if is_there else '# '}{line}\n" in file.read_text()
+
     def test_unbounded_inputs_get_placeholders_and_a_note(self, skeleton, make_fmu):
         half = variable("v", '<Real start="0" min="2"/>')
         scaled = variable("w", '<Real start="0" nominal="300"/>')
