@@ -29,7 +29,7 @@ def _is_watched() -> bool:
 
 
 @contextmanager
-def progress(total: int | None, what: str, unit: str = "steps") -> Iterator[Advance]:
+def progress(total: float | None, what: str, unit: str = "steps") -> Iterator[Advance]:
     """Show a bar, in a terminal or a notebook, if tqdm is installed (extra ``sb3``).
 
     Args:
@@ -45,11 +45,15 @@ def progress(total: int | None, what: str, unit: str = "steps") -> Iterator[Adva
     except ImportError:
         yield no_progress
         return
-    with tqdm(total=total, desc=what, unit=f" {unit}", ascii=True, leave=False, delay=1) as bar:
+    whole = None if total is None else round(total)
+    with tqdm(total=whole, desc=what, unit=f" {unit}", ascii=True, leave=False, delay=1) as bar:
+        done = 0.0
 
         def advance(steps: float, text: str = "") -> None:
+            nonlocal done
+            done += steps  # which may be parts of one, as those of averages
             if text:
                 bar.set_postfix_str(text, refresh=False)
-            bar.update(steps)
+            bar.update(round(done) - bar.n)
 
         yield advance
