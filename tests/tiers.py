@@ -239,7 +239,6 @@ SLOW_TESTS = (
     "test_trial.py::TestSurvival::test_is_remembered",
     "test_trial.py::TestSurvival::test_without_a_place",
     "test_vector_codec.py::test_gathered_as",
-    "test_windows_fmus.py::TestProgram::test_its_sources_fit",
 )
 """Others, by the beginning of their node ids."""
 
@@ -252,6 +251,7 @@ EXHAUSTIVE_TESTS = (
     "test_systems_ssp.py::TestDamaged",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
+    "test_windows_fmus.py::TestProgram::test_its_sources_fit",
 )
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 
