@@ -212,8 +212,14 @@ def missing_file(kind: str, path: Path, pattern: str) -> ConfigError:
         pattern: What it may have been meant to be, as a glob in its folder.
     """
     near = sorted(file.name for file in path.parent.glob(pattern))
+    if near:
+        return ConfigError(
+            f"{unknown_name(kind, path.name, near)} (looked in {shown(str(path.parent))})"
+        )
+    others = f"which has no {pattern}" if path.parent.is_dir() else "which does not exist"
     return ConfigError(
-        f"{unknown_name(kind, path.name, near)} (looked in {shown(str(path.parent))})"
+        f"there is no {kind} {shown(path.name)} in {shown(str(path.parent))}, {others}; give "
+        "another path"
     )
 
 

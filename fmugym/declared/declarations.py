@@ -278,7 +278,7 @@ class Declarations:
                 raise entry.lack(f"{key} must name at least one variable")
             twice = next((text for text, count in Counter(texts).items() if count > 1), None)
             if twice is not None:
-                raise entry.error(f"{twice!r} is named twice")
+                raise entry.error(f"{twice!r} is named twice; leave one of both out")
         return names
 
     def _with_fitted(

@@ -308,6 +308,8 @@ def _hint_of(text: str, error: str) -> str:
     line = re.search(r"at line (\d+)", error)
     lines = text.splitlines()
     key = lines[int(line[1]) - 1].partition("=")[0].strip() if line else ""
+    if re.match("Cannot (overwrite|declare|mutate)", error):
+        return f"; {key} is given there once more: remove one of both, or rename it"
     if key.isascii():
         return ""
     return f"; keys of other letters than those of English stand in quotes: {shown(key)}"

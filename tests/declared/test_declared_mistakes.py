@@ -219,3 +219,56 @@ CONSEQUENCES = {
 @pytest.mark.parametrize(("changes", "told"), CONSEQUENCES.values(), ids=CONSEQUENCES)
 def test_what_follows_from_a_mistake_is_not_told(changes, told):
     assert mistakes_of(pendulum(**changes)) == (told or ["setpoints.a.schedule.06"])
+
+
+CURES = {
+    "no FMU": (
+        ("fmu", "'nix.fmu'"),
+        "line 2, fmu: there is no FMU 'nix.fmu' in .* no \\*.fmu; give",
+    ),
+    "no folder": (("fmu", "'away/nix.fmu'"), "line 2, fmu: .*'nix.fmu'.*does not exist; give"),
+    "no number": (
+        ("parameters.m", "'heavy'"),
+        "line 5, parameters.m: m must be a number, or an expression of constants .* got 'heavy'$",
+    ),
+    "nearly a constant": (
+        ("parameters.m", "'pii'"),
+        "parameters.m: .*got 'pii'; did you mean 'pi'",
+    ),
+    "a name of two things": (
+        ("memory.price", "1"),
+        "line 6, data.price: the name 'price' is given twice, also at .*line 5, memory.p.*; rename",
+    ),
+    "a key of two lines": (
+        ("time_step", "2"),
+        "line 5.*time_step is given there once more: remove",
+    ),
+    "an action named twice": (
+        ("agent.actions", "['tau', 'tau']"),
+        "'tau' is named twice; leave one",
+    ),
+}
+
+
+@pytest.mark.parametrize(("wrong", "told"), CURES.values(), ids=CURES)
+def test_the_key_the_line_and_the_cure_are_told(wrong, told, tmp_path):
+    key, value = wrong
+    lines = {
+        "fmu": '{ bundled = "Pendulum" }',
+        "time_step": "0.1",
+        "reward": '"-abs(q)"',
+    }
+    more = {
+        "agent.actions": '"tau"',
+        "agent.observations": '"q"',
+        "variables.tau": "{ levels = [0, 1] }",
+    }
+    repeated = key == "time_step"
+    given = [f"{n} = {value if n == key and not repeated else one}" for n, one in lines.items()]
+    given += [f"{key} = {value}"] if key not in {*lines, *more} or repeated else []
+    given += ["data.price = { values = [1], step = 1 }"]
+    given += [f"{n} = {value if n == key else one}" for n, one in more.items()]
+    file = tmp_path / "wrong.toml"
+    file.write_text("\n".join(["", *given, ""]))
+    with pytest.raises(fmugym.ConfigError, match=told):
+        fmugym.load(file)
