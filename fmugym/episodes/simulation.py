@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -85,6 +86,13 @@ class Summary:
     end: str
     kpis: Mapping[str, float] = field(default_factory=dict)
     only_reward: float | None = None
+
+    @property
+    def has_no_reward(self) -> bool:
+        """Whether a step had a reward that is no finite number."""
+        is_of_reward = any(word in self.end for word in ("the reward", "_reward_policy"))
+        is_fault = self.end.startswith("fault: ") and is_of_reward
+        return is_fault or not math.isfinite(self.total_reward)
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers in types that JSON has."""

@@ -33,9 +33,9 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 
 ``info`` and ``new`` execute nothing of the FMU, the others do. Output is printable text; letters
 that the console lacks are escaped. The exit code is 0; 1 if something cannot be used (the error
-stream says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments are
-wrong; 130 after Ctrl-C, which keeps what was written until then. SIGTERM and SIGHUP do as Ctrl-C
-does; the exit code is then 143 or 129.
+stream says why), ``validate`` finds an error, ``simulate`` meets a reward that is no finite number,
+or ``demo`` has not learned; 2 if the arguments are wrong; 130 after Ctrl-C, which keeps what was
+written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143 or 129.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.

@@ -67,16 +67,16 @@ def add_simulate(commands: Commands) -> None:
     add_json(command)
 
 
-def _simulate(arguments: argparse.Namespace) -> None:
+def _simulate(arguments: argparse.Namespace) -> int:
     check_numbers(arguments, "episodes", "steps")
     if dataset_of(arguments) is not None:
         make_dataset(arguments)
-        return
+        return 0
     if arguments.plant is not None:
         for path in arguments.output:
             require_format(path, 1)
         follow_plant(arguments)
-        return
+        return 0
     players = players_of(arguments)
     for path in arguments.output:
         require_format(path, len(players))
@@ -95,6 +95,7 @@ def _simulate(arguments: argparse.Namespace) -> None:
     with shown_in_any_case(show), recording.finished(arguments.seed):
         for name, player in players.items():
             _play(arguments, recording, name, player, runs)
+    return int(any(one.has_no_reward for found in runs.values() for one in found))
 
 
 def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:

@@ -18,11 +18,14 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.baselines.arena import most_steps_of
-from fmugym.baselines.controller import FloatArray
-from fmugym.declared import Task, TaskEnv
+from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.parsing import controller_of, plans_ahead, simple_controllers
+from fmugym.checks import normal_form
+from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.likely_units import Misreading, misreadings
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
+from fmugym.episodes.simulation import action_of
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
 from fmugym.fmi.words import asked_for
@@ -226,6 +229,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     second = _play(env, env.action_space.sample, seed=1)
     yield from _of_observations(env, first, second, misread)
     yield _of_length(env)
+    yield from _of_controllers(env)
     yield _of_export(env)
 
 
@@ -467,7 +471,7 @@ def _of_observations(
         return
     names = env.observation_names or tuple(f"element {i}" for i in range(seen.shape[1]))
     contradicting = {one.name for one in misread if one.contradicts}
-    findings = [*_of_limits(env, space, names, seen, contradicting)]
+    findings = [*_of_limits(env, space, names, seen, contradicting | _erring(env, names))]
     if not _is_normalized(env):
         findings += _of_sizes(names, seen)
     findings += _of_still(env, names, np.concatenate([seen, second.observations]))
@@ -483,7 +487,7 @@ def _is_normalized(env: FMUEnv) -> bool:
 def _of_limits(
     env: FMUEnv, space: spaces.Box, names: tuple[str, ...], seen: Any, misread: Set[str]
 ) -> Iterator[Finding]:
-    """Tell observations beyond their limits, but for those that are in another unit."""
+    """Tell observations beyond their limits, but for those in another unit or with errors."""
     outside = ((seen < space.low.reshape(-1)) | (seen > space.high.reshape(-1))).any(axis=0)
     outside &= [name not in misread for name in names]
     if outside.any():
@@ -491,6 +495,17 @@ def _of_limits(
         yield Finding(
             "warning", "observations", f"outside of their limits: {listing}", "widen min and max"
         )
+
+
+def _erring(env: FMUEnv, names: Sequence[str]) -> set[str]:
+    """The forecasts with errors, which may exceed any limits."""
+    task = getattr(env, "task", None)
+    if not isinstance(task, Task):
+        return set()
+    forecasts = [one.value for one in task.root.child("agent").child("forecast").elements()]
+    erring = {normal_form(name) for one in forecasts if one.get("error") for name in one["of"]}
+    parts = ((name, *normal_form(name).partition("[+")) for name in names)
+    return {name for name, own, sign, _ in parts if sign and own in erring}
 
 
 def _range(env: FMUEnv, name: str, values: Any) -> str:
@@ -543,6 +558,43 @@ def _of_length(env: FMUEnv) -> Finding:
         "an episode has no limit of steps",
         "give episode_length, unless every episode terminates",
     )
+
+
+def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
+    """Bind each controller of the task file, but for those that only act in its warm-up."""
+    task = getattr(env, "task", None)
+    given = task.root.child("controllers").items() if isinstance(task, Task) else {}
+    if not isinstance(task, Task) or not given:
+        return
+    is_wrong = False
+    with closing(load(task.physical())) as physical:
+        for name in given.keys() - _acting_in_warm_up(task):
+            try:
+                with given[name].placing():
+                    _bind(physical, given[name].value)
+            except FMUGymError as error:
+                is_wrong = True
+                cure = "let it measure what the agent observes, and give a number for each action"
+                yield Finding("error", "controllers", str(error), cure)
+    if not is_wrong:
+        yield Finding("ok", "controllers", f"each can act: {', '.join(given)}")
+
+
+def _acting_in_warm_up(task: Task) -> set[str]:
+    """The names of controllers that act in the warm-up, each on an action of its own."""
+    given = task.root.child("warm_up").child("controller").value
+    return {str(one) for one in (given.values() if isinstance(given, Mapping) else (given,))}
+
+
+def _bind(env: FMUEnv, given: Any) -> None:
+    """Let a controller find what it needs; the copies that an MPC plans with take too long."""
+    if not isinstance(given, str):
+        action_of(env, str(given))
+    elif not plans_ahead(given):
+        (controller,) = simple_controllers({"": given})
+        controller.bind(env)
+    elif isinstance(warm := getattr(controller_of(given), "warm", None), Controller):
+        warm.bind(env)
 
 
 def _of_export(env: FMUEnv) -> Finding:

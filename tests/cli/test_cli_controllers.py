@@ -1,0 +1,154 @@
+"""Controllers of task files: each is checked by ``validate``, and may measure expressions."""
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym.baselines import controller_of
+from fmugym.episodes.simulation import policy_of, simulate
+from fmugym.tools.validation import validate
+
+TEXT = """
+fmu = {{ bundled = "Pendulum" }}
+time_step = "0.1s"
+episode_length = "1s"
+reward = "-abs(q)"
+[variables]
+tau = {{ min = -1, max = 1 }}
+q = {{ min = -9, max = 9 }}
+[setpoints]
+goal = 0.5
+[controllers]
+one = {one}
+two = "pid of=q setpoint=goal kp=0.1"
+[agent]
+actions = {actions}
+observations = ["q", "q_dot", "goal"]
+"""
+
+
+def write(folder, one, actions='["tau"]', end=""):
+    file = folder / "task.toml"
+    file.write_text(TEXT.format(one=one, actions=actions) + end)
+    return file
+
+
+RIGHT = {
+    "a name": '"pid of=q setpoint=goal kp=0.1"',
+    "a number": "0.25",
+    "an expression": """"pid of='q - goal' setpoint=0 kp=0.1\"""",
+    "an expression as a set point": '"pid of=q setpoint=goal+0.1*q_dot kp=0.1"',
+    "a constant": '"hysteresis of=q setpoint=pi/2 band=0.1"',
+    "a range": '"pid of=q setpoint=goal kp=0.1..1"',
+    "a plan": '''"mpc horizon=0.5s warm='pid of=q setpoint=goal kp=1'"''',
+}
+WRONG = {
+    "a name": ('"pid of=T setpoint=goal kp=0.1"', ("'T'", "'q'")),
+    "a set point": ('"pid of=q setpoint=gaol kp=0.1"', ("'gaol'", "'goal'")),
+    "an expression": (""""pid of='q - T' setpoint=0 kp=0.1\"""", ("'T'", "column 5")),
+    "a number": ("3.5", ("3.5", "Box")),
+    "a range": ('"pid of=T setpoint=goal kp=0.1..1"', ("'T'",)),
+    "a plan": ('''"mpc horizon=0.5s warm='pid of=T setpoint=goal kp=1'"''', ("'T'",)),
+}
+
+
+def findings_of(file):
+    report = validate(lambda: fmugym.load(file))
+    return [one for one in report.findings if one.check == "controllers"]
+
+
+@pytest.mark.parametrize("one", RIGHT.values(), ids=RIGHT)
+def test_right_ones(one, tmp_path):
+    (finding,) = findings_of(write(tmp_path, one))
+    assert finding.verdict == "ok"
+    assert "one, two" in finding.text
+
+
+@pytest.mark.parametrize(("one", "facts"), WRONG.values(), ids=WRONG)
+def test_wrong_ones(one, facts, tmp_path):
+    (finding,) = findings_of(write(tmp_path, one))
+    assert finding.verdict == "error"
+    assert finding.text.startswith("task.toml, line 12, controllers.one: ")
+    for fact in facts:
+        assert fact in finding.text
+
+
+def test_the_command_line_fails(tmp_path, cli):
+    code, out, _ = cli("validate", write(tmp_path, WRONG["a name"][0]))
+    assert code == 1
+    assert "task.toml, line 12, controllers.one" in out
+
+
+def test_of_two_actions(tmp_path):
+    """Each gives one action; one that acts in the warm-up only acts on one of them."""
+    more = '\n[inputs]\ntau = "tau_1 + tau_2"\n'
+    text = TEXT.replace(
+        "tau = {{ min = -1, max = 1 }}",
+        "tau_1 = {{ min = -1, max = 1 }}\ntau_2 = {{ min = -1, max = 1 }}",
+    )
+    file = tmp_path / "task.toml"
+    one, actions = '"pid of=q_ddot setpoint=0 kp=1"', '["tau_1", "tau_2"]'
+    warm = 'warm_up = { period = "0.2s", controller = { tau_1 = "one" } }\n'
+    file.write_text(warm + text.format(one=one.replace("q_ddot", "theta"), actions=actions) + more)
+    (finding,) = findings_of(file)
+    assert finding.verdict == "error"
+    for fact in ("controllers.two", "one number", "Box"):
+        assert fact in finding.text
+
+
+def test_an_expression_measures_what_its_names_do(tmp_path):
+    file = write(tmp_path, "0")
+    texts = "pid of='q - goal' setpoint=0 kp=0.3", "pid of=q setpoint=goal kp=0.3"
+    with closing(fmugym.load(file, physical=True)) as env:
+        found = [simulate(env, policy_of(env, text), 0, 10) for text in texts]
+        assert found[0] == found[1]
+        assert found[0].total_reward != simulate(env, policy_of(env, "one"), 0, 10).total_reward
+    with closing(fmugym.FMUVectorEnv(lambda: fmugym.load(file, physical=True), 3)) as envs:
+        observations, _ = envs.reset(seed=0)
+        actions = [controller_of(text).bind(envs).act(observations) for text in texts]
+        np.testing.assert_array_equal(*actions)
+        assert np.unique(actions[0]).size
+
+
+def test_in_a_warm_up(tmp_path):
+    texts = "pid of='q - goal' setpoint=0 kp=0.3", "pid of=q setpoint=goal kp=0.3"
+    seen = []
+    for text in texts:
+        end = f'[warm_up]\nperiod = "0.5s"\ncontroller = "{text}"\n'
+        with closing(fmugym.load(write(tmp_path, "0", end=end))) as env:
+            seen.append(env.reset(seed=0)[0].tolist())
+    assert seen[0] == seen[1]
+    assert seen[0][0] != 0
+    end = "[warm_up]\nperiod = 1\ncontroller = \"pid of='q - T' setpoint=0 kp=1\"\n"
+    with pytest.raises(fmugym.TaskError, match=r"line 19, warm_up.controller: unknown name 'T'"):
+        fmugym.load(write(tmp_path, "0", end=end))
+
+
+def test_an_error_of_a_forecast_is_not_outside_of_its_limits(tmp_path):
+    end = """
+[agent.forecast]
+of = ["price"]
+horizon = "0.5s"
+error = 2.0
+[data]
+price = { values = [0.0, 1.0], step = "1s", period = "2s", min = 0, max = 1 }
+"""
+    report = validate(lambda: fmugym.load(write(tmp_path, "0", end=end)))
+    assert not [one for one in report.findings if "price" in one.text and "outside" in one.text]
+    end = end.replace("max = 1", "max = 0.5").replace("error = 2.0", "")
+    report = validate(lambda: fmugym.load(write(tmp_path, "0", end=end)))
+    (finding,) = [one for one in report.findings if "outside" in one.text]
+    assert "price[+" in finding.text
+
+
+def test_a_reward_that_is_no_number_is_told_by_the_exit_status(tmp_path, cli):
+    file = write(tmp_path, "0")
+    assert cli("simulate", file, "--action", "0")[0] == 0
+    file.write_text(file.read_text().replace('"-abs(q)"', '"sqrt(0.3 - elapsed)"'))
+    code, out, _ = cli("simulate", file, "--action", "0")
+    assert code == 1
+    assert "the reward" in out
+    code, out, _ = cli("simulate", file, "--action", "0", "--steps", 2)
+    assert code == 0
