@@ -21,6 +21,7 @@ from fmugym.declared.declarations import is_reserved
 from fmugym.declared.likely_units import likely_units
 from fmugym.errors import ConfigError, plain
 from fmugym.search.guessing import both_controllers
+from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 from fmugym.tools.skeleton import (
     END_OF_EXPERIMENT,
