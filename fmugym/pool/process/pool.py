@@ -38,7 +38,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.form import Writer
-from fmugym.pool.health import HealthArray, new_arrays
+from fmugym.pool.health import Column, HealthArray, new_arrays
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
@@ -142,10 +142,19 @@ class ProcessPool(AskingPool):
             if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
             self._retire_grown(concerned, mask)
-            while concerned:
-                concerned = self._reset(concerned, variables, values, mask)
-            self._group.note_lost()
-            return int(np.count_nonzero(self.statuses[mask] > WARNING_CODE))
+            used = [s for s in concerned if not s.is_new]
+            troubled = self._reset_until_done(concerned, variables, values, mask)
+            exhausted = self._replace_exhausted(used, mask) if troubled else []
+            if exhausted:
+                troubled = self._reset_until_done(exhausted, variables, values, mask)
+            return troubled
+
+    def _reset_until_done(self, supervisors: list[Supervisor], *request: Any) -> int:
+        """Reset blocks, also in new workers; returns how many instances have trouble."""
+        while supervisors:
+            supervisors = self._reset(supervisors, *request)
+        self._group.note_lost()
+        return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     def extract(self) -> bool:
         """See ``Pool.extract``."""
@@ -160,7 +169,7 @@ class ProcessPool(AskingPool):
     ) -> list[Supervisor]:
         """Reset blocks; returns those that lost a worker in whose place a new one may succeed.
 
-        It was used before, or it was killed from outside, or its FMU made no further instance.
+        Either it was used before, or it was killed from outside.
         """
         listing, texts = request_listing(variables, self._version), _texts_of(variables)
         used = {s for s in supervisors if not s.is_new}
@@ -171,20 +180,15 @@ class ProcessPool(AskingPool):
             block, writer = supervisor.block, Writer().block(listing)
             writer.array(values[:, block], np.float64).array(mask[block], np.bool_)
             supervisor.forget_output()
-            supervisor.lend(texts)
+            if texts:
+                supervisor.lend(texts)
             supervisor.tell(Request.RESET, writer.form(), supervisor.read_growth)
 
         for supervisor in self._group.run(RESET, alive, tell):
             supervisor.note_success()
             block = supervisor.block
             self._group.lost[block] &= ~mask[block]
-        played = [s for s in alive if s in used and not s.is_new]
-        exhausted = [s for s in played if self._is_exhausted(s, mask)]
-        for supervisor in exhausted:
-            self._replace_exhausted(supervisor)
-        return exhausted + [
-            s for s in supervisors if (s in used and s.is_new) or s.kills > kills[s]
-        ]
+        return [s for s in supervisors if (s in used and s.is_new) or s.kills > kills[s]]
 
     def _is_exhausted(self, supervisor: Supervisor, mask: MaskArray) -> bool:
         """Whether the FMU makes no further instance in the process of a worker.
@@ -197,12 +201,17 @@ class ProcessPool(AskingPool):
         texts = [self.failure(block.start + int(index)) for index in np.flatnonzero(dead)]
         return any(REFUSED_ANEW in text and not speaks_of_licence(text) for text in texts)
 
-    def _replace_exhausted(self, supervisor: Supervisor) -> None:
-        reason = f"worker process {supervisor.pid} was replaced: its FMU made no further instance"
-        self._group.retire(supervisor, reason)
-        if not self._has_told:
-            self._has_told = True
-            self._log.warning("%s: %s", self._setup.fmu.path.name, reason)
+    def _replace_exhausted(self, used: Sequence[Supervisor], mask: MaskArray) -> list[Supervisor]:
+        """End workers in which the FMU makes no further instance; returns their supervisors."""
+        exhausted = [s for s in used if not s.is_new and self._is_exhausted(s, mask)]
+        for supervisor in exhausted:
+            how = "was replaced: its FMU made no further instance"
+            reason = f"worker process {supervisor.pid} {how}"
+            self._group.retire(supervisor, reason)
+            if not self._has_told:
+                self._has_told = True
+                self._log.warning("%s: %s", self._setup.fmu.path.name, reason)
+        return exhausted
 
     def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
         """End the workers that have played an episode, so that each episode has a new process."""
@@ -354,6 +363,28 @@ class ProcessPool(AskingPool):
         with self._lock:
             if not self._group.refusal:
                 self._answers(self._group.able, Request.COUNT_STEPS)
+            self._take_counts()
+
+    def _take_counts(self) -> None:
+        for supervisor in self._group.supervisors:
+            supervisor.take_counts()
+
+    def forget_health(self) -> None:
+        """See ``Pool.forget_health``."""
+        super().forget_health()
+        for supervisor in self._group.supervisors:
+            supervisor.counts[:] = 0
+
+    def note_fault(self, index: int) -> None:
+        """See ``Pool.note_fault``."""
+        supervisor = self._group.of(index)
+        supervisor.counts[index - supervisor.block.start, Column.NOT_FINITE] += 1
+
+    def info(self) -> dict[str, npt.NDArray[Any]]:
+        """See ``Pool.info``."""
+        if self._spec.fault_retries:
+            self._take_counts()
+        return super().info()
 
     def _memory_growth(self) -> HealthArray:
         growth = np.zeros(self.num_instances, np.int64)

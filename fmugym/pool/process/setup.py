@@ -148,14 +148,13 @@ class Setup:
         """
         own = self.fmu.extract() / _WORKERS / str(self.number)
         try:
-            shutil.rmtree(own, ignore_errors=True)
-            scratch = own / "scratch"
-            scratch.mkdir(parents=True)
+            scratch = _emptied(own / "scratch")
             if not self.needs_copy:
                 if self.copies:
                     copy_libraries(self.fmu, self.num_instances)
                 return replace(self, scratch=scratch)
             files, left_out = own / "files", shutil.ignore_patterns(_WORKERS)
+            shutil.rmtree(files, ignore_errors=True)
             shutil.copytree(self.folder, files, ignore=left_out)
         except ordinary(OSError, shutil.Error) as error:
             raise FMULoadError(
@@ -230,6 +229,17 @@ class Setup:
         writer.integers(memory.size, self.count, 0)
         *arrays, echo, bell = memory.offsets
         writer.integers(*arrays, ECHO_SIZE, echo, bell)
+
+
+def _emptied(folder: Path) -> Path:
+    """Make an empty folder."""
+    try:
+        os.makedirs(folder)
+    except FileExistsError:
+        if os.listdir(folder):
+            shutil.rmtree(folder)
+            folder.mkdir()
+    return folder
 
 
 def _libraries_before(fmu: FMU, folder: Path) -> tuple[tuple[str, str], ...]:

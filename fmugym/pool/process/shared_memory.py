@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym._native import copy_arrays
-from fmugym.pool.health import Arrays, layout_of
+from fmugym.pool.health import Arrays, HealthArray, layout_of
 from fmugym.pool.spec import PoolSpec
 
 if sys.platform == "linux":
@@ -104,6 +104,8 @@ class Memory:
 class Copies:
     """Copies a block of the arrays of a pool to the memory of a worker, and back.
 
+    The counts are the worker's; the pool gets them when somebody asks for them.
+
     Args:
         arrays: Those of the pool; nothing is copied if they are those of the memory.
         block: The indices of the worker's instances.
@@ -115,15 +117,17 @@ class Copies:
         blocks = {
             "inputs": arrays.inputs[:, block],
             "mask": arrays.mask[block],
-            "counts": arrays.counts[block],
             "outputs": arrays.outputs[:, block],
             "observations": arrays.observations[block],
             "statuses": arrays.statuses[block],
         }
+        self._counts: tuple[tuple[HealthArray, ...], tuple[HealthArray, ...]] = ((), ())
         if arrays is memory.arrays:
             blocks = {}
+        else:
+            self._counts = (arrays.counts[block],), (memory.arrays.counts,)
         self._pairs = tuple(own[name] for name in blocks), tuple(blocks.values())
-        self._for_step = tuple(part[:3] for part in self._pairs)
+        self._for_step = tuple(part[:2] for part in self._pairs)
 
     def give(self) -> None:
         """Copy what the worker may read or change."""
@@ -137,6 +141,10 @@ class Copies:
         """Copy what the worker may have changed."""
         shared, blocks = self._pairs
         copy_arrays(blocks, shared)
+
+    def take_counts(self) -> None:
+        """Copy the counts."""
+        copy_arrays(*self._counts)
 
 
 def _anonymous_file(size: int) -> int:

@@ -136,6 +136,8 @@ class Supervisor:
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
         initializations: How many initializations its processes have begun.
         losses: How processes died or hung, in their order.
+        counts: What its instances do; see ``Arrays``.
+        take_counts: Copies them to the arrays of the pool.
         kills: How many of them were killed from outside, as by the system if memory is short.
     """
 
@@ -159,7 +161,9 @@ class Supervisor:
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
         self._echo, self._progress = memory.echo, memory.arrays.progress
-        self._copies = Copies(arrays, setup.block, memory)
+        self.counts = memory.arrays.counts
+        copies = self._copies = Copies(arrays, setup.block, memory)
+        self.take_counts = copies.take_counts
         self._done = b""
         self._read: Callable[[Reader], Any] | None = None
         self._content = b""

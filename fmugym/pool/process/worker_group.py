@@ -160,7 +160,7 @@ class WorkerGroup:
     def _lose(self, supervisor: Supervisor) -> None:
         """Note the loss of a block, and start its next worker before it is needed."""
         block, arrays = supervisor.block, self._arrays
-        arrays.counts[block, Column.DEATHS] += 1
+        supervisor.counts[:, Column.DEATHS] += 1
         self.lost[block] = True
         observed = arrays.observations.shape[1]
         np.copyto(arrays.observations[block], arrays.outputs[:observed, block].T)
@@ -194,7 +194,7 @@ class WorkerGroup:
         block = supervisor.block
         self.lost[block] = True
         supervisor.retire(reason, self._deadline("its end"))
-        self._arrays.counts[block, [[Column.REPLACEMENTS], [Column.RECYCLINGS]]] += 1
+        supervisor.counts[:, [Column.REPLACEMENTS, Column.RECYCLINGS]] += 1
 
     def of(self, index: int) -> Supervisor:
         """The supervisor of an instance."""
