@@ -18,6 +18,7 @@ __all__ = [
     "FIXED_STEP_SOLVERS",
     "INITIALIZATION_FACTOR",
     "ISOLATIONS",
+    "REUSING",
     "SAMPLINGS",
     "SOLVERS",
     "START_TIME",

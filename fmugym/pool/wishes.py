@@ -77,8 +77,7 @@ class Wishes:
             )
         Wine.ready()
 
-    @property
-    def decides_who_shares(self) -> bool:
-        """Whether the caller has decided which instances share a library or a process."""
-        in_workers = self.isolation == "process" and self.workers is not None
+    def decides_who_shares(self, num_instances: int) -> bool:
+        """Whether the caller has decided which of N instances share a library, or that none do."""
+        in_workers = self.isolation == "process" and (self.workers or 0) >= num_instances
         return self.private_libraries is not None or in_workers

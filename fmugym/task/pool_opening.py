@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from itertools import count, takewhile
+from math import floor
 from pathlib import Path
 from typing import Any, Final
 
@@ -170,11 +171,14 @@ class PoolOpening:
         if self.isolation is not None:
             check_option("isolation", self.isolation, ISOLATIONS)
 
-    def open(self, num_instances: int = 1, **options: Any) -> Pool:
+    def open(
+        self, num_instances: int = 1, *, max_episode_steps: int | None = None, **options: Any
+    ) -> Pool:
         """Open a pool.
 
         Args:
             num_instances: N.
+            max_episode_steps: The most steps of an episode, if the config does not limit it more.
             options: Wishes of ``fmugym.pool.wishes.Wishes``, before the config's own.
 
         Raises:
@@ -192,12 +196,21 @@ class PoolOpening:
             "call_timeout": self.config.foreign.call_timeout,
             "reset_method": self.config.foreign.reset_method,
             "starts": self.draws.starts(),
+            "length": self._length(max_episode_steps),
             "spare": most is None or num_instances < most,
         }
         options = own | options
         if self.backend is not None:
             options["backend"] = self.backend
         return make_pool(self.fmu, self.spec, num_instances, self.log, **options)
+
+    def _length(self, max_episode_steps: int | None) -> int | None:
+        """The most steps of an episode; None if nothing limits them."""
+        limits = [max_episode_steps, self.config.max_episode_steps]
+        if self.spec.stop_time is not None:
+            span = self.spec.stop_time - self.spec.start_time
+            limits.append(max(1, floor(span / self.spec.time_step + 1e-9)))
+        return min((limit for limit in limits if limit is not None), default=None)
 
     def apart(self) -> PoolOpening:
         """Return the same with an FMU that is not shared."""

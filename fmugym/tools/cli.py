@@ -56,8 +56,8 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``trial``: what the first meeting on this machine has shown: ``deterministic``, the
   ``noisy_outputs``, the grades of ``resets`` by method, the ``reset_method``, the
   ``component_resets`` of a system by the names of its components, what ``several_instances``
-  need, ``isolate``, the grade of an ``initial_state`` in another process, how many
-  ``instances_at_once`` it used, and the ``deaths`` of workers; null before
+  need, ``isolate``, whether it ``cannot_be_read_before_a_step``, how many ``instances_at_once``
+  and ``initializations`` it used, and its ``findings``, a sentence each; null before
 - ``capabilities``: flags by name, those of ``fmugym.archive.description.Capabilities``
 - ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
 - ``fixed_internal_step_size``: in s

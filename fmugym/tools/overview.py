@@ -93,7 +93,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "cannot_be_read_before_a_step": verdict.blind_start,
         "instances_at_once": verdict.instances,
         "initializations": verdict.initializations,
-        "deaths": list(verdict.reasons),
+        "findings": list(verdict.findings),
     }
 
 
@@ -173,12 +173,12 @@ def as_text(facts: Mapping[str, Any]) -> str:
 
 
 def tables(facts: Mapping[str, Any]) -> Iterator[str]:
-    """The part of an overview below the heading: findings, variables, and how many are not listed.
+    """The part of an overview below the heading: the trial, findings, variables, those not listed.
 
     Args:
         facts: What ``overview`` returned.
     """
-    yield from (*_findings(facts), *_tables(facts), *_not_listed(facts))
+    yield from (*_trial_lines(facts), *_findings(facts), *_tables(facts), *_not_listed(facts))
 
 
 def headed(facts: Mapping[str, Any], kind: str, rows: Mapping[str, str]) -> Iterator[str]:
@@ -234,7 +234,7 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
     parts = parts or ["it survived"]
     parts.append(f"tried with {count} {'instance' if count == 1 else 'instances'} at once")
     parts.append(f"{trial['initializations']} initializations")
-    return "; ".join([*parts, *trial["deaths"]])
+    return "; ".join(parts)
 
 
 _GRADES: Final = {
@@ -263,6 +263,14 @@ def _experiment(facts: Mapping[str, Any]) -> str:
         + ("not given" if value is None else f"{value:g}{units.get(name, ' s')}")
         for name, value in times.items()
     )
+
+
+def _trial_lines(facts: Mapping[str, Any]) -> Iterator[str]:
+    sentences = (facts["trial"] or {}).get("findings", ())
+    if sentences:
+        yield "\nFirst meeting"
+    for sentence in sentences:
+        yield f"  - {plain(sentence)}"
 
 
 def _findings(facts: Mapping[str, Any]) -> Iterator[str]:

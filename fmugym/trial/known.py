@@ -66,10 +66,9 @@ def known_verdict(fmu: FMU) -> Verdict | None:
 def with_harm(verdict: Verdict, fmu: FMU) -> Verdict:
     """Add the harm to its process that the FMU has done with any other config."""
     known = known_verdict(fmu)
-    if known is None or not known.isolate or verdict.isolate:
+    if known is None or verdict.harm:
         return verdict
-    reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
-    return replace(verdict, isolate=True, reasons=tuple(reasons))
+    return replace(verdict, harm=known.harm).finding(known.harm)
 
 
 def state_files(fmu: FMU) -> str:
@@ -80,21 +79,23 @@ def state_files(fmu: FMU) -> str:
         return ""
 
 
-def known_resuming(fmu: FMU, spec: PoolSpec, starts: Any) -> SaveMethod | None:
+def known_resuming(fmu: FMU, spec: PoolSpec, starts: Any, length: int | None) -> SaveMethod | None:
     """How states in the middle of an episode can be saved; None if that was not tried."""
     try:
-        return SaveMethod(recall(_resuming_key(fmu, spec, starts)) or "")
+        return SaveMethod(recall(_resuming_key(fmu, spec, starts, length)) or "")
     except ValueError:
         return None
 
 
-def note_resuming(fmu: FMU, spec: PoolSpec, starts: Any, method: SaveMethod) -> None:
+def note_resuming(
+    fmu: FMU, spec: PoolSpec, starts: Any, length: int | None, method: SaveMethod
+) -> None:
     """Keep the result of a trial."""
-    remember(_resuming_key(fmu, spec, starts), str(method))
+    remember(_resuming_key(fmu, spec, starts, length), str(method))
 
 
-def _resuming_key(fmu: FMU, spec: PoolSpec, starts: Any) -> str:
-    return f"{verdict_key(fmu, spec, starts)}-resuming"
+def _resuming_key(fmu: FMU, spec: PoolSpec, starts: Any, length: int | None) -> str:
+    return f"{verdict_key(fmu, spec, starts)}-resuming-{length}"
 
 
 # What an FMU is known by

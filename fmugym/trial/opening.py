@@ -22,8 +22,7 @@ from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.wishes import Wishes
 from fmugym.trial.known import is_exempt, known_resuming
 from fmugym.trial.plan import Plan, is_alone
-from fmugym.trial.resuming import method_that_works
-from fmugym.trial.trial import compare, examine
+from fmugym.trial.trial import compare, examine, saving_method
 from fmugym.trial.trial_episodes import Starts
 from fmugym.trial.verdict import Grade, Verdict
 
@@ -37,6 +36,7 @@ def make_pool(
     log: logging.Logger,
     *,
     starts: Starts | None = None,
+    length: int | None = None,
     spare: bool = True,
     **wishes: Any,
 ) -> Pool:
@@ -47,7 +47,8 @@ def make_pool(
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        starts: The start values of two episodes, for the trial of resets.
+        starts: The start values of two episodes, for the trial.
+        length: The most steps of an episode, for the trial; None if nothing limits them.
         spare: Whether there may be one more instance, in a trial of saved states.
         wishes: See ``fmugym.pool.wishes.Wishes``.
 
@@ -63,36 +64,37 @@ def make_pool(
     wishing = Plan(fmu, num_instances, spec, wished.for_native(fmu))
 
     def attempt() -> Pool:
-        return _open(_made(wishing, starts, spare=spare), log)
+        return _open(_made(wishing, starts, length, spare=spare), log)
 
     return wait_for_licence(spec.licence_wait, log, attempt)
 
 
-def _made(plan: Plan, starts: Starts | None, *, spare: bool) -> Plan:
+def _made(plan: Plan, starts: Starts | None, length: int | None, *, spare: bool) -> Plan:
     """Complete a plan; that may take a trial of the FMU."""
     fmu, exempt = plan.fmu, is_exempt(plan.fmu)
     tried = replace(plan.spec, num_observed=0, leak_limit=None, fault_retries=0, blind_start=False)
-    plan = plan.completed(_verdict(plan, tried, starts))
+    plan = plan.completed(_verdict(plan, tried, starts, length))
     offered = offered_method(fmu.description, plan.spec)
     if fmu.bundled or offered is SaveMethod.REPLAY:
         return plan.saving_by(offered)
-    known = SaveMethod.REPLAY if exempt else known_resuming(fmu, tried, starts)
+    known = SaveMethod.REPLAY if exempt else known_resuming(fmu, tried, starts, length)
     if known is not None or not spare:
         return plan.saving_by(known or SaveMethod.REPLAY)
-    ask = partial(method_that_works, fmu, tried, starts)
+    ask = partial(saving_method, fmu, tried, starts, length)
     return replace(plan, spec=replace(plan.spec, records=True), save_by=ask)
 
 
-def _verdict(plan: Plan, spec: PoolSpec, starts: Starts | None) -> Verdict:
+def _verdict(plan: Plan, spec: PoolSpec, starts: Starts | None, length: int | None) -> Verdict:
     """Get the verdict on an FMU from a trial, if it is not exempt."""
     fmu = plan.fmu
     if fmu.bundled:
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
-    shared = not (plan.how.decides_who_shares or is_alone(fmu))
-    several = shared and plan.num_instances > 1
+    shared = not (plan.how.decides_who_shares(plan.num_instances) or is_alone(fmu))
+    count = plan.num_instances if shared else 1
+    task: dict[str, Any] = {"num_instances": count, "length": length}
     if is_exempt(fmu):
-        return compare(fmu, spec, starts) if several else Verdict()
-    return examine(fmu, spec, starts, several=several, must_survive=not plan.is_isolated)
+        return compare(fmu, spec, starts, **task) if count > 1 else Verdict()
+    return examine(fmu, spec, starts, must_survive=not plan.is_isolated, **task)
 
 
 @licence_errors()
@@ -127,6 +129,7 @@ def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
         workers=how.workers,
         threads=threads,
         own_files=plan.own_files,
+        private_libraries=bool(how.private_libraries),
         call_timeout=how.call_timeout,
     )
     pool.retry_resets(plan.fmu.path.name, log)

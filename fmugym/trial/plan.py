@@ -49,12 +49,12 @@ class Plan:
         plan = replace(self, spec=spec.beginning_by(ResetMethod(wished or verdict.reset_method)))
         if wished is None:
             plan = plan._with_resets(verdict)
-        if self.num_instances > 1 and not self.how.decides_who_shares:
+        if self.num_instances > 1 and not self.how.decides_who_shares(self.num_instances):
             plan = plan._with_neighbours(verdict.neighbours or Neighbours.INDEPENDENT)
         if verdict.isolate and plan.how.isolation is None:
-            why = f": {verdict.reasons[-1]}" if verdict.reasons else ""
             plan = plan._with(isolation="process")
-            plan = plan._noting(f"{plan._name} harms its process{why}. It runs in worker processes")
+            text = f"{plan._name} harms its process: {verdict.harm}. It runs in worker processes"
+            plan = plan._noting(text)
         return plan._with_means_of_reset()._with_limits_of_reading(verdict)
 
     @property
@@ -100,6 +100,7 @@ class Plan:
         """Keep instances from disturbing each other, unless the caller insists."""
         why = f"the instances of {self._name} disturb each other"
         kept = "isolation='none' keeps them in one process all the same"
+        few = f"workers={self.how.workers} keeps several in one process all the same"
         if is_alone(self.fmu):
             why, neighbours = (
                 f"a process may have one instance of {self._name}",
@@ -113,16 +114,23 @@ class Plan:
             text = f"{self._name}: its instances are initialized one at a time"
             return plan._noting(text, logging.INFO)
         if neighbours is Neighbours.ONE_THREAD:
-            plan, what = self._with(threads=1), "all are stepped by one thread"
-        elif neighbours is Neighbours.LIBRARIES and not self.is_isolated:
+            plan, what = self._with(threads=1), "all are stepped by one thread, one after another"
+            why += " in threads"
+        elif neighbours is Neighbours.LIBRARIES and self._shares_processes:
             plan, what = self._with(private_libraries=True), "each gets a copy of the library"
         elif self.how.isolation == "none":
             plan, what = self, kept
         else:
             workers = self.how.workers or self.num_instances
             plan = replace(self._with(isolation="process", workers=workers), own_files=True)
-            what = _FILES
-        return plan._noting(f"{why}: {what}", logging.INFO if self.is_isolated else logging.WARNING)
+            what = _FILES if workers >= self.num_instances else few
+        is_cured = self.is_isolated and what not in (kept, few)
+        return plan._noting(f"{why}: {what}", logging.INFO if is_cured else logging.WARNING)
+
+    @property
+    def _shares_processes(self) -> bool:
+        """Whether several instances are in one process, and stay there."""
+        return not self.is_isolated or self.how.workers is not None
 
     def _with_means_of_reset(self) -> Plan:
         """Provide the private libraries or the processes that the reset method needs."""

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.systems.system_plan import SystemPlan
 
-__all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
+__all__ = ["MOST_INSTANCES", "Finding", "Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 7
+_FORMAT: Final = 8
 
-FRUGAL: Final = (
-    "its initializations are slow or need licences, so no episode returned to earlier start values"
-)
-"""What a trial leaves out to need fewer initializations."""
+MOST_INSTANCES: Final = 4
+"""The most instances that a trial has at once."""
 
 
 class Grade(StrEnum):
@@ -32,6 +30,23 @@ class Grade(StrEnum):
     """The outputs differ, or an episode ends too early."""
     FAILS = "fails"
     """The FMU returned an error or crashed its process."""
+
+
+class Finding(NamedTuple):
+    """The answer of a step of the trial.
+
+    Attributes:
+        grade: How well the FMU keeps its promise.
+        text: Where it does not; empty if it does.
+    """
+
+    grade: Grade
+    text: str
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether it keeps it to the last bit."""
+        return self.grade is Grade.BITWISE
 
 
 class Neighbours(StrEnum):
@@ -58,12 +73,16 @@ class Verdict:
         resets: The grade of each reset method that was tried.
         components: How each component of a system begins an episode; empty if all do alike.
         neighbours: What several instances need; None if only one was tried.
-        isolate: Whether a lone instance has harmed its process.
+        harm: How a lone instance has harmed its process; empty if it has not.
         blind_start: Whether the FMU cannot be read before its first step.
         unreadable: The names of outputs that could not be read at all.
         instances: How many instances the trial used at once, each of which may take a licence.
         initializations: How many initializations the trial took, which may be slow.
-        reasons: The observations, one sentence each, for the log and ``fmugym info``.
+        length: The most steps of an episode for which it holds; None if for any.
+        unlimited: Whether it holds for tasks whose episodes nothing limits.
+        is_frugal: Whether fewer episodes were played, because initializations are slow or need
+            licences.
+        findings: A sentence for each finding, for the log and ``fmugym info``.
     """
 
     complete: bool = False
@@ -71,12 +90,40 @@ class Verdict:
     resets: Mapping[ResetMethod, Grade] = field(default_factory=dict)
     components: tuple[ResetMethod, ...] = ()
     neighbours: Neighbours | None = None
-    isolate: bool = False
+    harm: str = ""
     blind_start: bool = False
     unreadable: tuple[str, ...] = ()
     instances: int = 1
     initializations: int = 0
-    reasons: tuple[str, ...] = ()
+    length: int | None = None
+    unlimited: bool = True
+    is_frugal: bool = False
+    findings: tuple[str, ...] = ()
+
+    @property
+    def isolate(self) -> bool:
+        """Whether a lone instance has harmed its process."""
+        return bool(self.harm)
+
+    def covers(self, length: int | None, num_instances: int) -> bool:
+        """Whether it tells all of a task.
+
+        Args:
+            length: The most steps of an episode; None if nothing limits them.
+            num_instances: How many instances there are.
+        """
+        is_longer = not self.unlimited if length is None else length > (self.length or length)
+        if is_longer:
+            return False
+        if num_instances == 1:
+            return True
+        tried = self.instances >= min(num_instances, MOST_INSTANCES)
+        return self.neighbours is not None and (tried or self.neighbours is Neighbours.PROCESSES)
+
+    def finding(self, *sentences: str) -> Verdict:
+        """The verdict with more findings, each of them once; empty ones are left out."""
+        told = dict.fromkeys((*self.findings, *filter(None, sentences)))
+        return replace(self, findings=tuple(told))
 
     @property
     def deterministic(self) -> bool:
@@ -91,6 +138,11 @@ class Verdict:
                 if self.resets.get(method) is wanted:
                     return method
         return ResetMethod.PROCESS if self.resets else ResetMethod.RESET
+
+    def steady(self, spec: PoolSpec) -> PoolSpec:
+        """Leave out the outputs that tell nothing about other instances, unless all are such."""
+        kept = tuple(variable for variable in spec.outputs if variable.name not in self.noisy)
+        return replace(spec, outputs=kept) if kept else spec
 
     def components_of(self, plan: SystemPlan | None) -> dict[str, str]:
         """The methods of a system's components by their names; empty if all begin alike."""
@@ -115,12 +167,15 @@ class Verdict:
                 resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
                 components=tuple(map(ResetMethod, data["components"])),
                 neighbours=None if neighbours is None else Neighbours(neighbours),
-                isolate=bool(data["isolate"]),
+                harm=str(data["harm"]),
                 blind_start=bool(data["blind_start"]),
                 unreadable=tuple(map(str, data["unreadable"])),
                 instances=int(data["instances"]),
                 initializations=int(data["initializations"]),
-                reasons=tuple(map(str, data["reasons"])),
+                length=None if data["length"] is None else int(data["length"]),
+                unlimited=bool(data["unlimited"]),
+                is_frugal=bool(data["is_frugal"]),
+                findings=tuple(map(str, data["findings"])),
             )
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None

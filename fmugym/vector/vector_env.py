@@ -135,7 +135,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         env = self.inside.prototype
         try:
-            self.inside.pool = env.inside.opening.open(self.num_envs, **pool_options)
+            self.inside.pool = env.inside.opening.open(
+                self.num_envs, max_episode_steps=max_episode_steps, **pool_options
+            )
             try:
                 env.inside.use(self.inside.pool)
                 env.inside.has_chosen = True  # to be stepped by an engine

@@ -18,10 +18,9 @@ from fmugym.config import EnvConfig
 from fmugym.errors import LicenceError
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial import rehearsal
+from fmugym.trial import reference
 from fmugym.trial.known import known_verdict
-from fmugym.trial.subject import Subject
-from fmugym.trial.trial_episodes import Starts
+from fmugym.trial.trial import examine
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -265,7 +264,7 @@ class TestInitializations:
         text = f"and {verdict.initializations} initialization(s) in all"
         assert text in caplog.text
         assert f"{verdict.initializations} initializations" in ran("info", path)
-        left_out = "no episode returned to earlier start values" in "".join(verdict.reasons)
+        left_out = "no episode returned to earlier start values" in "".join(verdict.findings)
         assert left_out == bool(config)
 
     def test_of_a_vector_environment(self, folder, licences):
@@ -288,13 +287,12 @@ class TestInitializations:
         assert after.initializations <= before.initializations + 13
 
     def test_slow_ones_are_measured(self, folder, licences, monkeypatch):
-        monkeypatch.setattr(rehearsal, "_SLOW_INITIALIZATION", 0.0)
+        monkeypatch.setattr(reference, "_SLOW_INITIALIZATION", 0.0)
         fmu = fmugym.FMU(make_fmu(folder, "licensed"))
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), STEP)
-        trial = rehearsal.Rehearsal(Subject(fmu), spec, Starts())
-        trial.find_reference()
-        assert trial.is_frugal
-        assert trial.grade(ResetMethod.RESTORE) == "bitwise"
+        verdict = examine(fmu, spec, length=50)
+        assert verdict.is_frugal
+        assert verdict.resets == {ResetMethod.RESTORE: "bitwise"}
 
     def test_trials_keep_to_the_limit_as_well(self, folder, licences):
         """The other environment needs a trial of its own; no more than one instance exists."""

@@ -374,7 +374,7 @@ def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
 
     fmu = SystemFMU(masses([fmus[2], fmus[3]]))
     spec = PoolSpec((), (fmu.variable("first.y1"),), 0.1)
-    verdict = examine(fmu, spec, several=True)
+    verdict = examine(fmu, spec, num_instances=2, length=100)
     assert verdict.complete
     assert verdict.deterministic
     assert str(verdict.reset_method) == "restore"

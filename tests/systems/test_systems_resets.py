@@ -206,7 +206,7 @@ class TestChoice:
 def verdict_of(system):
     fmu = system.as_fmu()
     spec = PoolSpec((fmu.variable("a.u"),), tuple(map(fmu.variable, outputs_of(fmu))), 0.1)
-    return examine(fmu, spec, several=False)
+    return examine(fmu, spec, length=100)
 
 
 class TestTrial:

@@ -50,6 +50,9 @@ class Quirk:
         probe_timeout: In seconds.
         may_die_early: Whether the FMU may end the trial before a reset method is tried. Then
             episodes begin by the reset function.
+        length: The most steps of an episode.
+        equal: The token of an FMU with the same values, where the tests' own process cannot load
+            this one.
     """
 
     token: str
@@ -60,6 +63,8 @@ class Quirk:
     versions: tuple[int, ...] = (1, 2, 3)
     probe_timeout: float = 30.0
     may_die_early: bool = False
+    length: int = 60
+    equal: str = ""
 
     def __str__(self):
         return self.token
@@ -85,6 +90,7 @@ def keeps(what, method="instance"):
     return Quirk(f"reset keeps {what}", f"keeps {what} in a reset", method, log=log)
 
 
+LONG = 1500
 BAD_RESET = "does not begin anew when it is reset"
 DISTURB = "disturb each other"
 
@@ -118,6 +124,10 @@ QUIRKS = (
     Quirk("reset is not exact", "begins with a rounding error after a reset", "instance"),
     Quirk("library keeps", "keeps a drift in a global variable of its library", "library",
           "libraries", log=BAD_RESET),
+    Quirk("long memory", "keeps values of the last 1,000 steps in a reset", "instance",
+          log=BAD_RESET, length=LONG),
+    Quirk("long memory of the library", "keeps such values in global variables", "library",
+          "libraries", log=BAD_RESET, length=LONG),
     Quirk("restore forgets", "leaves its state out of its FMU state (restores are given up)",
           versions=STATES),
     Quirk("restore keeps the time", "leaves the time out of its FMU state (likewise)",
@@ -145,7 +155,35 @@ QUIRKS = (
     Quirk("overruns with two", "writes beyond its memory if there is a second instance",
           neighbours="libraries", log=DISTURB),
     Quirk("strtok", "initializes with `strtok`", neighbours="one initialization at a time"),
+    Quirk(
+        "heap model", "has one model on the heap, which steps if the time is later than its own",
+        method="reset", neighbours="libraries", log=DISTURB,
+    ),
+    Quirk("heap buffer", "steps with a buffer on the heap that all instances share",
+          neighbours="libraries", log=DISTURB),
+    Quirk("shared outputs", "has a buffer on the heap for the outputs of all instances", "restore",
+          "libraries", log=DISTURB),
+    Quirk("newest turns", "turns the sign of the instance that was initialized last, at t = 1 s",
+          neighbours="libraries", log=DISTURB),
+    Quirk("initialized together", "shares its state with those that are initialized with it",
+          method="reset", neighbours="libraries", log=DISTURB),
+    Quirk("two slots", "has room for the states of two instances on the heap",
+          method="reset", neighbours="libraries", log=DISTURB),
+    Quirk("static time", "steps from the time of the last step in a global variable",
+          method="reset", neighbours="libraries", log=DISTURB),
+    Quirk("static random numbers", "draws from global variables, which an initialization seeds",
+          method="reset", neighbours="libraries", log=DISTURB),
+    Quirk("counts instances", "depends on the number of instances",
+          neighbours="libraries", log=DISTURB),
+    Quirk("reset disturbs", "changes the instance that was initialized last in a reset",
+          neighbours="libraries", log=DISTURB),
+    Quirk("free disturbs", "changes the instance that was initialized last when it is freed",
+          neighbours="libraries", log=DISTURB),
     # Memory, files and calls
+    Quirk("free before a step", "frees a bad pointer if it is freed before any step (it runs in "
+          "worker processes)", log="harms its process", equal="well behaved"),
+    Quirk("free before initialization", "does so before its initialization (likewise)",
+          log="harms its process", equal="well behaved"),
     Quirk("warns", "returns Warning in each step until its first reset"),
     Quirk("overruns", "writes a byte beyond its memory (it runs in worker processes)",
           log="harms its process", may_die_early=True),

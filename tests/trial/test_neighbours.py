@@ -12,9 +12,7 @@ import fmugym
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.known import known_verdict
-from fmugym.trial.neighbours import disturb_in_threads
-from fmugym.trial.subject import Subject
-from fmugym.trial.trial_episodes import Starts
+from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Neighbours
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
@@ -87,17 +85,23 @@ class TestOneInitializationAtATime:
 
 class TestGrades:
     @pytest.mark.parametrize(
-        ("token", "at_once", "in_turn"),
-        [("fine", False, False), ("strtok", True, False), ("static buffer", True, True)],
+        ("token", "neighbours", "finding"),
+        [
+            ("fine", "independent", "two instances in two threads give the same as in one"),
+            (
+                "strtok",
+                "one initialization at a time",
+                "two instances in two threads do not give the same as in one",
+            ),
+            ("static buffer", "libraries", "a step writes to data that all instances"),
+        ],
     )
-    def test_tell_what_disturbs(self, folder, token, at_once, in_turn):
-        path = make_fmu(folder, token)
-        fmu = fmugym.FMU(path)
+    def test_tell_what_disturbs(self, folder, token, neighbours, finding):
+        fmu = fmugym.FMU(make_fmu(folder, token))
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), STEP)
-        subject = Subject(fmu)
-        disturb = functools.partial(disturb_in_threads, subject, spec, Starts(), step_seconds=1e-3)
-        assert disturb() is at_once
-        assert disturb(one_initialization=True) is in_turn
+        verdict = examine(fmu, spec, num_instances=2, length=50)
+        assert verdict.neighbours == neighbours
+        assert finding in " ".join(verdict.findings)
 
     def test_of_steps_that_disturb_each_other(self, folder, caplog):
         path = make_fmu(folder, "static buffer")

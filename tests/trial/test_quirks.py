@@ -27,9 +27,9 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
 from fmugym.trial import plan as trial_plan
-from fmugym.trial.inputs import inputs_of_two
 from fmugym.trial.known import known_verdict
 from fmugym.trial.trial import examine
+from fmugym.trial.trial_episodes import Inputs
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
@@ -94,10 +94,9 @@ def assert_right(env, path):
     env.close()
 
 
-def make_vector(path, gain=None, **options):
-    config = {"gain": gain, "probe_timeout": options.pop("probe_timeout", 30.0)}
+def make_vector(path, quirk, gain=None, **options):
     return fmugym.FMUVectorEnv(
-        lambda: QuirkEnv(path, **config),
+        lambda: QuirkEnv(path, gain, **config_of(quirk)),
         NUM_ENVS,
         autoreset_mode="Disabled",
         hooks="array",
@@ -116,35 +115,40 @@ def assert_vector_right(envs, path, gains=None):
     envs.close()
 
 
+def config_of(quirk):
+    return {"probe_timeout": quirk.probe_timeout, "max_episode_steps": quirk.length}
+
+
 class TestEpisodes:
     @cases
     def test_single(self, make_fmu, version, quirk):
         path = make_fmu(quirk.token, version)
-        env = QuirkEnv(path, probe_timeout=quirk.probe_timeout)
+        env = QuirkEnv(path, **config_of(quirk))
         assert env.reset_method in quirk.methods_of(version)
         env.reset(seed=5)
-        assert_right(env, path)
+        assert_right(env, make_fmu(quirk.equal or quirk.token, version))
 
     @in_turn({"version,quirk": ONCE})
     def test_with_the_same_start_values(self, make_fmu, version, quirk):
         """So that states are restored."""
         path = make_fmu(quirk.token, version)
-        assert_right(QuirkEnv(path, gain=1.5, probe_timeout=quirk.probe_timeout), path)
+        env = QuirkEnv(path, gain=1.5, **config_of(quirk))
+        assert_right(env, make_fmu(quirk.equal or quirk.token, version))
 
     @in_turn({"version,quirk": ONCE, "way": ["one", "two"]})
     def test_vector(self, make_fmu, version, quirk, way):
         path = make_fmu(quirk.token, version)
-        envs = make_vector(path, probe_timeout=quirk.probe_timeout, **WAYS[way])
+        envs = make_vector(path, quirk, **WAYS[way])
         envs.reset(seed=3)
-        assert_vector_right(envs, path)
+        assert_vector_right(envs, make_fmu(quirk.equal or quirk.token, version))
 
     @in_turn({"version,quirk": ONCE, "way": ["default", "process"]})
     def test_vector_with_the_same_start_values(self, make_fmu, version, quirk, way):
         """Each environment has its own, in all episodes."""
         path, gains = make_fmu(quirk.token, version), [0.5, 1.0, 2.0]
-        envs = make_vector(path, gain=1.0, probe_timeout=quirk.probe_timeout, **WAYS[way])
+        envs = make_vector(path, quirk, gain=1.0, **WAYS[way])
         envs.set_attr("gain", gains)
-        assert_vector_right(envs, path, gains)
+        assert_vector_right(envs, make_fmu(quirk.equal or quirk.token, version), gains)
 
 
 @pytest.fixture
@@ -158,12 +162,14 @@ def nothing_warned(monkeypatch):
 def test_verdict(make_fmu, version, quirk, caplog):
     """What several instances need, and what the log tells."""
     path = make_fmu(quirk.token, version)
-    envs = make_vector(path, probe_timeout=quirk.probe_timeout)
+    envs = make_vector(path, quirk)
     inside = envs.get_attr("inside")[0]
     spec, starts = inside.spec, inside.draws.starts()
     envs.close()
     fmu = fmugym.FMU(path, probe_timeout=quirk.probe_timeout)
-    verdict = examine(fmu, spec, starts, several=True, must_survive=False)
+    verdict = examine(
+        fmu, spec, starts, num_instances=NUM_ENVS, length=quirk.length, must_survive=False
+    )
     assert verdict.neighbours == quirk.neighbours
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert quirk.log in " ".join(warnings)
@@ -244,7 +250,7 @@ BAD_RESETS = [
     (version, quirk)
     for version, quirk in CASES
     if quirk.method == "instance"
-    and quirk.token not in ("second episode hangs", "reset frees twice")
+    and quirk.token not in ("second episode hangs", "reset frees twice", "long memory")
 ]
 
 
@@ -272,7 +278,7 @@ def test_inputs_stay_within_their_limits(make_fmu):
     """An FMU may fail beyond them, and such a failure is no sign of shared globals."""
     fmu = fmugym.FMU(make_fmu("well behaved"))
     spec = PoolSpec((replace(fmu.variable("u"), bounds=(-0.5, 0.25)),), (), STEP)
-    rows = inputs_of_two(spec, 50, 1.0)
+    rows = Inputs(spec, 1.0).until(50)
     assert np.min(rows) < -0.4
     assert 0.24 < np.max(rows) <= 0.25
     assert np.all((np.array(rows) >= -0.5) & (np.array(rows) <= 0.25))
@@ -288,7 +294,7 @@ def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
 @pytest.mark.usefixtures("nothing_warned")
 def test_an_output_that_tells_the_processors_time_is_no_reason_for_processes(make_fmu, caplog):
     path = make_fmu("tells its time")
-    make_vector(path).close()
+    make_vector(path, quirk_table.Quirk("tells its time", "")).close()
     assert "gives other values of calls each time" in caplog.text
     assert "disturb each other" not in caplog.text
     verdict = known_verdict(fmugym.FMU(path))
@@ -352,8 +358,8 @@ class TestVerdict:
             noisy=("y",),
             resets={ResetMethod.RESTORE: Grade.WRONG, ResetMethod.RESET: Grade.TOLERANCE},
             neighbours=Neighbours.ONE_THREAD,
-            isolate=True,
-            reasons=("in the first step it hung",),
+            harm="in the first step it hung",
+            findings=("in the first step it hung",),
         )
         assert Verdict.from_text(verdict.to_text()) == verdict
         assert verdict.reset_method is ResetMethod.RESET

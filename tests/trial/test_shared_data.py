@@ -55,5 +55,4 @@ def test_steps_in_threads_do_not_deviate(tmp_path, kind):
     expected = expected_outputs(infos["drawn"]["gain"], inputs.astype(np.float64))
     deviations = np.count_nonzero(np.array(seen) != expected.astype(np.float32))
     assert deviations == 0, known_verdict(fmugym.FMU(path)).neighbours
-    needed = Neighbours.ONE_THREAD if kind == "objects" else Neighbours.LIBRARIES
-    assert known_verdict(fmugym.FMU(path)).neighbours is needed
+    assert known_verdict(fmugym.FMU(path)).neighbours is Neighbours.LIBRARIES

@@ -105,7 +105,7 @@ class TestProgress:
 
     def test_of_a_trial_is_logged(self, folder, caplog):
         DemandingEnv(make_fmu(folder, "slow")).close()
-        text = "Demanding.fmu: the trial, in the rehearsal of state restores, has taken 0 s so far"
+        text = "Demanding.fmu: the trial, in the comparison of state restores, has taken 0 s so far"
         assert text in caplog.text
 
     def test_is_not_logged_by_default(self, folder, caplog):

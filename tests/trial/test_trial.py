@@ -22,7 +22,7 @@ from fmugym.caching import cache_folder
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import launcher
 from fmugym.pool.process.output import describe_exit
-from fmugym.trial import subject, trial
+from fmugym.trial import trial, workers
 from fmugym.trial.known import known_verdict
 from fmugym.trial.opening import make_pool
 
@@ -59,15 +59,15 @@ def nothing_left(own_trials, temp_root, same_working_directory):
 @pytest.fixture
 def started(monkeypatch):
     """The trials that are started."""
-    subjects = []
+    found = []
 
-    class Subject(trial.Subject):
+    class Workers(trial.Workers):
         def __init__(self, *args):
             super().__init__(*args)
-            subjects.append(self)
+            found.append(self)
 
-    monkeypatch.setattr(trial, "Subject", Subject)
-    return subjects
+    monkeypatch.setattr(trial, "Workers", Workers)
+    return found
 
 
 def spec_of(fmu):
@@ -116,12 +116,12 @@ class TestDeath:
     @pytest.mark.parametrize("token", ["hang in a later step", "hang in a later reset"])
     def test_a_hang_after_quick_calls_ends_soon(self, make_fmu, token, monkeypatch):
         """Its limit follows from the calls before."""
-        monkeypatch.setattr(subject, "_LEAST", 1.0)
+        monkeypatch.setattr(workers, "_LEAST", 1.0)
         path, start = make_fmu(token), time.monotonic()
         PlainEnv(path, CONFIG).close()
         assert time.monotonic() - start < 40.0
-        (reason,) = known_verdict(FMU(path)).reasons
-        limit = re.search(r"did not come back within ([\d.]+) s \(those before took", reason)
+        findings = " ".join(known_verdict(FMU(path)).findings)
+        limit = re.search(r"did not come back within ([\d.]+) s \(those before took", findings)
         assert float(limit[1]) < 10.0
 
     def test_is_not_remembered(self, make_fmu, started):

@@ -16,20 +16,33 @@
 
 enum variable { U, Y, GAIN, TAU, CLOCK, CALLS, RETURNS, VARIABLES };
 
-enum { NUMBERS = 8, OVERRUN = 16 };
+enum { NUMBERS = 8, OVERRUN = 16, MEMORY = 1000, SLOTS = 2 };
 
 struct Animal {
     double values[VARIABLES];
-    double x, first_gain;
-    int resets;
-    bool ready, hangs, stopped;
+    double x, first_gain, sign;
+    int resets, number;
+    bool ready, hangs, stopped, stepped;
     char token[40], folder[PATH_MAX];
     double *numbers; /* a block of memory of its own */
+    double *block;   /* one that it may share */
+    double memory[MEMORY];
+    int place;
 };
 
+/* A model on the heap, for those that keep only a pointer to it in their library. */
+typedef struct {
+    double x, gain, time, buffer;
+} Model;
+
 /* What instances of one library share. */
-static double shared_x, shared_gain, shared_drift, buffer;
-static Animal saved;
+static double shared_x, shared_gain, shared_drift, buffer, shared_time;
+static double shared_memory[MEMORY];
+static int shared_place;
+static unsigned shared_seed;
+static Animal saved, *newest;
+static Model *model;
+static double *block, *slots;
 static int made, in_use;
 static bool read_beside_library;
 
@@ -47,6 +60,7 @@ static void set_start(Animal *me) {
     me->values[GAIN] = shared_gain = 1.0;
     me->values[TAU] = 0.5;
     me->x = 0.0;
+    me->sign = 1.0;
     me->ready = me->hangs = me->stopped = false;
 }
 
@@ -102,13 +116,23 @@ Animal *zoo_instantiate(const Birth *birth) {
     }
     set_start(me);
     me->numbers = calloc(NUMBERS, sizeof *me->numbers);
-    made++;
+    model = model == NULL ? calloc(1, sizeof *model) : model;
+    slots = slots == NULL ? calloc(SLOTS, sizeof *slots) : slots;
+    me->number = made++;
     in_use++;
     return me;
 }
 
 void zoo_free(Animal *me) {
+    if ((is(me, "free before a step") && !me->stepped) ||
+        (is(me, "free before initialization") && !me->ready)) {
+        me->numbers++; /* no longer what the heap knows */
+    }
     in_use--;
+    if (is(me, "free disturbs") && newest != NULL && newest != me) {
+        newest->x = 0.0;
+    }
+    newest = newest == me ? NULL : newest;
     free(me->numbers);
     free(me);
 }
@@ -136,6 +160,14 @@ int zoo_exit(Animal *me) {
     const bool prepared = prepare(me);
 
     shared_x = me->x;
+    shared_time = 0.0;
+    shared_seed = 1;
+    *model = (Model){.gain = me->values[GAIN]};
+    newest = me;
+    if (is(me, "initialized together")) {
+        me->block = block = block == NULL ? calloc(1, sizeof *block) : block;
+    }
+    slots[me->number % SLOTS] = me->x;
     me->first_gain = me->resets == 0 ? me->values[GAIN] : me->first_gain;
     me->ready = true;
     if (!is(me, "reset keeps outputs")) {
@@ -161,15 +193,67 @@ static double find_gain(Animal *me) {
     return gain;
 }
 
-static void integrate(Animal *me, double step_size) {
-    double *x = is(me, "globals") ? &shared_x : &me->x;
-    const double gain = find_gain(me);
-    const int steps = (int)(step_size * 1000.0 + 0.5);
+/* The state as it is found in each step. */
+static double *find_state(Animal *me) {
+    if (is(me, "globals")) {
+        return &shared_x;
+    } else if (is(me, "initialized together")) {
+        block = NULL; /* those that are initialized from now on get another one */
+        return me->block;
+    }
+    return is(me, "two slots") ? &slots[me->number % SLOTS] : &me->x;
+}
 
+/* Pass a number through memory that others use, too. */
+static double passed(double number, double *through) {
+    *through = number;
+    usleep(20);
+    return *through;
+}
+
+/* What came in a number of steps before. */
+static double delayed(double *memory, int *place, double number) {
+    const double before = memory[*place];
+
+    memory[*place] = number;
+    *place = (*place + 1) % MEMORY;
+    return before;
+}
+
+/* One model for all: it steps only if the time is later than its own. */
+static void step_model(Animal *me, double step_size, double gain) {
+    const double time = me->values[CLOCK] + step_size;
+
+    if (time > model->time) {
+        model->x += step_size * (gain * me->values[U] - model->x / me->values[TAU]);
+        model->time = time;
+    }
+    me->values[Y] = model->x;
+}
+
+static void integrate(Animal *me, double step_size) {
+    double *x = find_state(me);
+    const double gain = find_gain(me);
+    int steps = (int)(step_size * 1000.0 + 0.5);
+
+    if (is(me, "heap model")) {
+        step_model(me, step_size, gain);
+        return;
+    }
     if (is(me, "static buffer")) {
-        buffer = *x;
-        usleep(20);
-        *x = buffer;
+        *x = passed(*x, &buffer);
+    } else if (is(me, "heap buffer")) {
+        *x = passed(*x, &model->buffer);
+    } else if (is(me, "static time")) {
+        steps = (int)((me->values[CLOCK] + step_size - shared_time) * 1000.0 + 0.5);
+        shared_time = me->values[CLOCK] + step_size;
+    } else if (is(me, "static random numbers")) {
+        shared_seed = shared_seed * 1103515245u + 12345u;
+        *x += 1e-9 * (shared_seed >> 16);
+    } else if (is(me, "counts instances")) {
+        *x += 0.001 * (in_use - 1);
+    } else if (is(me, "newest turns") && me->values[CLOCK] >= 1.0 - 1e-9) {
+        newest->sign = -1.0;
     }
     for (int i = 0; i < steps; i++) {
         *x += 0.001 * (gain * me->values[U] - *x / me->values[TAU]);
@@ -180,7 +264,12 @@ static void integrate(Animal *me, double step_size) {
     } else if (is(me, "noise")) {
         *x += 1e-9 * (double)(rand() % 100);
     }
-    me->values[Y] = *x;
+    me->values[Y] = model->buffer = me->sign * *x;
+    if (is(me, "long memory of the library")) {
+        me->values[Y] += delayed(shared_memory, &shared_place, *x);
+    } else if (is(me, "long memory")) {
+        me->values[Y] += delayed(me->memory, &me->place, *x);
+    }
 }
 
 static void corrupt(Animal *me) {
@@ -212,6 +301,7 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
     while (me->hangs) {
         sleep(1);
     }
+    me->stepped = true;
     if (is(me, "stops, slow at first") && me->values[CALLS] == 0.0) {
         usleep(200000); /* as a library does that loads its data then */
     }
@@ -243,6 +333,9 @@ static bool asks_in_vain(const Animal *me, const unsigned *references, size_t co
 
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {
     zoo_read(me->values, references, count, values);
+    for (size_t i = 0; i < count && is(me, "shared outputs"); i++) {
+        values[i] = references[i] == Y ? model->buffer : values[i];
+    }
     if (asks_in_vain(me, references, count)) {
         return ERROR;
     }
@@ -274,6 +367,9 @@ int zoo_reset(Animal *me) {
         return ERROR;
     }
     set_start(me);
+    if (is(me, "reset disturbs") && newest != NULL) {
+        newest->x = 0.0;
+    }
     if (is(me, "reset keeps the state")) {
         me->x = before.x;
     } else if (is(me, "reset keeps inputs")) {

@@ -186,7 +186,7 @@ MOMENTS = {
 MOMENTS_OF_TRIAL = {
     **MOMENTS,
     "first episode": (SUPERVISOR, "Supervisor.reply", "before", 20),
-    "rehearsal": ("fmugym.trial.rehearsal", "Rehearsal._worst_grade", "before", 1),
+    "comparison of resets": ("fmugym.trial.reference", "Reference.worst", "before", 1),
     "verdict": ("os", "replace", "after", 1),
 }
 MOMENTS_IN_WINE = [

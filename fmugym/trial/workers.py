@@ -1,4 +1,4 @@
-"""An unknown FMU on trial: its instances are in worker processes, whose deaths are findings."""
+"""Worker processes of a trial: an FMU may crash or hang in them, which is a finding."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.progress import progress
 from fmugym.pool.spec import INITIALIZATION_FACTOR, PoolSpec
 
-__all__ = ["CLOSING", "STEP", "DeathError", "Subject", "TriedPool"]
+__all__ = ["CLOSING", "INITIALIZATION", "STEP", "DeathError", "TriedPool", "Workers"]
 
 logger = logging.getLogger(__name__)
 
@@ -71,8 +71,8 @@ def _factor(call: str) -> int:
     return INITIALIZATION_FACTOR if call in (OPENING, INITIALIZATION) else 1
 
 
-class Subject:
-    """An FMU on trial.
+class Workers:
+    """Processes in which an FMU is tried, one after another.
 
     Args:
         fmu: The FMU.
@@ -80,8 +80,7 @@ class Subject:
     Attributes:
         fmu: As given.
         checks_heap: Whether the C library looks for memory errors.
-        is_harmful: Whether a lone instance has harmed its process.
-        reasons: How processes have ended, a sentence each.
+        harm: How a lone instance has harmed its process; empty if none has.
         instances: How many instances there were at once at most.
         initializations: How many initializations there were.
     """
@@ -89,8 +88,7 @@ class Subject:
     def __init__(self, fmu: FMU) -> None:
         self.fmu = fmu
         self.checks_heap = not self.fmu.in_wine
-        self.is_harmful = False
-        self.reasons: list[str] = []
+        self.harm = ""
         self.instances, self.initializations = 1, 0
         self._longest: dict[str, float] = {}  # the seconds of calls
 
@@ -156,6 +154,10 @@ class Subject:
         """The same as a time-out of a ``ProcessPool``."""
         return self.limit(call)[0] / _factor(call)
 
+    def slowest(self, call: str) -> float:
+        """How many seconds the slowest call of a kind has taken; 0 before the first one."""
+        return self._longest.get(_kind(call), 0.0)
+
     def note_call(self, call: str, begin: float) -> None:
         """Note a call that has begun at that time of ``time.perf_counter``."""
         kind, seconds = _kind(call), time.perf_counter() - begin
@@ -169,17 +171,12 @@ class Subject:
             how = f"did not come back within {seconds:g} s ({why})"
         return DeathError(call, stage, how, loss.lines)
 
-    def attempt(self, attempt: Callable[[], R], *, refused: R, died: R, alone: bool = False) -> R:
-        """Try something.
+    def attempt(self, attempt: Callable[[], R], *, failed: Callable[[str], R]) -> R:
+        """Try something that is not only done with a fresh instance.
 
         Args:
             attempt: It.
-            refused: What is true if the FMU returns errors.
-            died: What is true if its process dies.
-            alone: Whether the process has nothing but a fresh instance.
-
-        Returns:
-            What it finds, or one of these.
+            failed: What is true if the FMU returns errors or its process dies, by the reason.
 
         Raises:
             LicenceError: If the FMU gets no licence, which tells nothing of it.
@@ -188,11 +185,11 @@ class Subject:
             return attempt()
         except LicenceError:
             raise
-        except FMUGymError:
-            return refused
+        except FMUGymError as error:
+            return failed(f"it is refused: {error}")
         except DeathError as death:
-            self.note(death, alone=alone)
-            return died
+            self.note(death)
+            return failed(str(death))
 
     def note(self, death: DeathError, *, alone: bool = False) -> None:
         """Note how a process has ended.
@@ -204,25 +201,24 @@ class Subject:
         Raises:
             LicenceError: If it got no licence, which tells nothing of the FMU.
         """
-        is_quick = alone and death.call != STEP  # or else the call does not tell how far it came
-        reason = f"in {death.call if is_quick else death.stage} {death}"
+        is_told = alone and death.call not in (STEP, CLOSING)  # or else by the part of the trial
+        reason = f"in {death.call if is_told else death.stage} {death}"
         if speaks_of_licence(reason):
             raise LicenceError(reason)
-        self.reasons.append(reason)
-        self.is_harmful |= alone
+        self.harm = self.harm or (reason if alone else "")
 
 
 class _TriedGroup(WorkerGroup):
     """A worker on trial: the time of its calls is limited, and its death is an error.
 
     Args:
-        subject: The FMU.
+        workers: The processes of the trial.
         stage: The part of the trial.
         arguments: See ``WorkerGroup``.
     """
 
-    def __init__(self, subject: Subject, stage: str, *arguments: Any) -> None:
-        self._subject, self._stage = subject, stage
+    def __init__(self, workers: Workers, stage: str, *arguments: Any) -> None:
+        self._workers, self._stage = workers, stage
         self._calls = {RESET: INITIALIZATION, A_STEP: FIRST_STEP}
         super().__init__(*arguments)
 
@@ -236,25 +232,25 @@ class _TriedGroup(WorkerGroup):
         """
         call = self._calls.get(doing, STEP)
         self._calls[A_STEP] = STEP if doing == A_STEP else self._calls[A_STEP]
-        self.call_timeout = self._subject.call_timeout(call)
+        self.call_timeout = self._workers.call_timeout(call)
         begin = time.perf_counter()
         try:
             return super().run(doing, supervisors, tell)
         finally:
             self.require_alive(call)
-            self._subject.note_call(call, begin)
+            self._workers.note_call(call, begin)
 
     def require_alive(self, call: str) -> None:
         """Raise a ``DeathError`` if the process has not survived a call."""
         if self.losses:
-            raise self._subject.death(call, self._stage, self.losses[0])
+            raise self._workers.death(call, self._stage, self.losses[0])
 
 
 class TriedPool(ProcessPool):
     """Instances on trial in one process.
 
     Args:
-        subject: The FMU.
+        workers: The processes of the trial.
         stage: The part of the trial.
         fmu: Its files; closed with the pool.
         spec: What to do at each reset and step.
@@ -263,24 +259,25 @@ class TriedPool(ProcessPool):
 
     Attributes:
         fmu: As given.
+        spec: As given.
     """
 
     _group: _TriedGroup
 
     def __init__(
         self,
-        subject: Subject,
+        workers: Workers,
         stage: str,
         fmu: FMU,
         spec: PoolSpec,
         num_instances: int,
         **options: Any,
     ) -> None:
-        self.fmu = fmu
+        self.fmu, self.spec = fmu, spec
         options = {"workers": 1, "threads": 1, "on_trial": True} | options
-        options["call_timeout"] = subject.call_timeout(OPENING)
-        options["closing_time"], _ = subject.limit(CLOSING)
-        options["make_group"] = partial(_TriedGroup, subject, stage)
+        options["call_timeout"] = workers.call_timeout(OPENING)
+        options["closing_time"], _ = workers.limit(CLOSING)
+        options["make_group"] = partial(_TriedGroup, workers, stage)
         super().__init__(fmu, spec, num_instances, _SILENT, **options)
 
     def require_survival(self) -> None:
