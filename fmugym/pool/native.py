@@ -77,7 +77,7 @@ class NativePool(AskingPool):
             processor that this process may use. The results do not depend on it.
         private_libraries: Whether each instance gets a private copy of the FMU's library, and so
             of its global variables. By default only if the FMU says that it can be
-            instantiated only once per process. See ``fmugym.trial.neighbours``.
+            instantiated only once per process. See ``fmugym.trial.trial``.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.

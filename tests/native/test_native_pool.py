@@ -359,7 +359,7 @@ class TestIsolation:
         assert self.run(native(path, ["work"], ["total"], 3)) == [3, 3, 3]
 
     def test_where_no_copy_can_be_made(self, native, shared, monkeypatch):
-        def full(*_):
+        def full(*_, **options):
             raise OSError("no space left on device")
 
         monkeypatch.setattr("fmugym.archive.fmu.shutil.copytree", full)
