@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -114,6 +115,7 @@ def stray_libraries(library: Path) -> list[Path]:
     return stray[::-1]
 
 
+@lru_cache(maxsize=64)
 def calls_python(library: Path) -> bool:
     """Whether a library calls the Python of its process, which one thread can do at a time.
 

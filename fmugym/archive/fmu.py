@@ -27,6 +27,7 @@ from fmugym.archive import loader
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.dependencies import (
     ask_in_a_child,
+    calls_python,
     describe_missing,
     load_globally,
     missing_libraries,
@@ -313,6 +314,10 @@ class FMU(KnownArguments):
     def libraries_in(self, folder: Path) -> list[tuple[FMU, Path]]:
         """The same FMUs, and their libraries there."""
         return [(part, place / part.library) for part, place in self.parts_in(folder)]
+
+    def calls_python(self) -> bool:
+        """Whether a library calls the Python of its process; see ``dependencies.calls_python``."""
+        return any(calls_python(path) for _, path in self.libraries_in(self.extract()))
 
     def libraries_before(self, folder: Path) -> list[tuple[str, str]]:
         """The libraries to load before those of the FMUs.

@@ -145,7 +145,7 @@ class NativePool(AskingPool):
         )
         arrays = self.inputs, self.outputs, self.statuses, self.observations, self._counts
         try:
-            return _native.Pool(form, arrays, Receiver(log, description))
+            return _native.Pool(form, arrays, Receiver(log, description), fmu.calls_python())
         except ordinary(OSError) as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error), fmu.extract())) from None
 
@@ -397,5 +397,7 @@ def _as_mask(mask: MaskArray | None) -> MaskArray | None:
 
 
 def _close(pool: _native.Pool, fmu: FMU) -> None:
-    pool.close()
-    fmu.close()
+    try:
+        pool.close()
+    finally:
+        fmu.close()

@@ -1,7 +1,7 @@
-"""How a signal ends the command line: as Ctrl-C does, with clean-ups made.
+"""How a signal ends the command line: Ctrl-C, or another one as it does, with clean-ups made.
 
 By default SIGTERM (of ``kill``, ``timeout`` and batch systems) and SIGHUP (of a terminal that
-closes) end a process at once, and its temporary folders remain.
+closes) end a process at once, and its temporary folders remain. Ctrl-C waits for the FMU.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 
 __all__ = ["SignalledEnd", "end_as_after_ctrl_c", "exit_code"]
 
-_NAMES: Final = ("SIGTERM", "SIGHUP")
+_NAMES: Final = ("SIGINT", "SIGTERM", "SIGHUP")
 
 _TIMEOUT: Final = 5.0
 """Seconds until the process is ended by force: its FMU may hang, and Python waits for the call."""
@@ -43,7 +43,8 @@ class SignalledEnd(KeyboardInterrupt):
 def end_as_after_ctrl_c() -> None:
     """Let the signals raise ``SignalledEnd``, but for those that the process ignores (``nohup``).
 
-    To be called in the main thread.
+    To be called in the main thread. While an FMU works whose code is Python, they only note that
+    they shall; see ``native/python/handlers.c``.
     """
     numbers = {
         number

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from fmugym.archive.dependencies import calls_python
 from fmugym.archive.fmu import FMU
 from fmugym.pool.backend.backend_choice import pool_of_backend
 from fmugym.pool.base import Pool
@@ -118,8 +117,7 @@ def _open(plan: Plan, log: logging.Logger) -> SavingPool:
 def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
     what, how = (plan.fmu, plan.spec, plan.num_instances, log), plan.how
     threads = how.threads
-    libraries = (library for _, library in plan.fmu.libraries_in(plan.fmu.extract()))
-    if threads is None and any(map(calls_python, libraries)):
+    if threads is None and plan.fmu.calls_python():
         threads = 1  # several would spend most of the time with handing Python over
     if not plan.is_isolated:
         private = how.private_libraries

@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "arrays.h"
+#include "handlers.h"
 #include "programs.h"
 
 #include "texts.h"
@@ -100,7 +101,7 @@ PyMODINIT_FUNC PyInit__native(void) {
     }
     pool_prepare_process();
     sleep_function = find_object("time", "sleep");
-    if (sleep_function == NULL || !add_type(module, &access_type, &access_spec) ||
+    if (sleep_function == NULL || !handlers_prepare() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
         !add_type(module, &guard_type, &guard_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||

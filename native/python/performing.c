@@ -2,8 +2,7 @@
 
 #include <string.h>
 
-#include "python.h"
-
+#include "handlers.h"
 #include "inside.h"
 
 PyObject *sleep_function;
@@ -132,7 +131,7 @@ static void work_and_leave(PyPool *self, Work *work, void *context, Signals *sig
     pool_leave(&self->pool);
 }
 
-bool perform(PyPool *self, int length, Work *work, void *context) {
+static bool enter_and_work(PyPool *self, int length, Work *work, void *context) {
     Entry entry = pool_try_enter(&self->pool);
     Signals signals = {0};
 
@@ -151,4 +150,17 @@ bool perform(PyPool *self, int length, Work *work, void *context) {
         return false;
     }
     return explain_entry(entry);
+}
+
+bool perform(PyPool *self, int length, Work *work, void *context) {
+    Held held;
+
+    if (!self->calls_python) {
+        return enter_and_work(self, length, work, context);
+    }
+    if (!handlers_hold(&held)) {
+        return false;
+    }
+    const bool done = enter_and_work(self, length, work, context);
+    return handlers_release(&held) && done;
 }

@@ -3,9 +3,22 @@
 
 #include <stdlib.h>
 
-#include "python.h"
+#include "handlers.h"
 
 PyTypeObject *snapshot_type;
+
+static void abandon(PyPool *pool, Snapshot *snapshot) {
+    Held held = {.count = 0};
+    PyObject *type, *value, *traceback;
+
+    PyErr_Fetch(&type, &value, &traceback);
+    if (pool->calls_python && !handlers_hold(&held)) {
+        PyErr_WriteUnraisable(NULL);
+    }
+    pool_abandon(&pool->pool, snapshot);
+    handlers_postpone(&held);
+    PyErr_Restore(type, value, traceback);
+}
 
 /* May run on any thread and at any time, even during a call of the pool. */
 static void snapshot_dealloc(PyObject *object) {
@@ -14,7 +27,7 @@ static void snapshot_dealloc(PyObject *object) {
     freefunc release_memory = (freefunc)PyType_GetSlot(type, Py_tp_free);
 
     if (self->snapshot != NULL) {
-        pool_abandon(&((PyPool *)self->pool)->pool, self->snapshot);
+        abandon((PyPool *)self->pool, self->snapshot);
     }
     Py_XDECREF(self->pool);
     release_memory(object);
