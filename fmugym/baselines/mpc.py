@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
 from typing import Any, Final, NamedTuple
@@ -43,6 +44,9 @@ _DECADES: Final = 1.5
 _PENALTY: Final = 1e9
 """How much more a unit of a cost beyond its limit counts than one of the reward."""
 
+_FAILURE: Final = 1e100
+"""How much each step counts that a plan lacks because a copy has failed."""
+
 _FORECAST: Final = re.compile(r"(.+)\[\+(.+) s\]")
 
 
@@ -51,10 +55,11 @@ class MPC(Controller):
 
     In each step, candidates for the actions until the horizon play on copies of the environment,
     and the first action of the best one is taken. The reward is that of the task, and plans that
-    keep the limits of costs come first. The search begins with the best of the plan of the step
-    before and what simple controllers would do. Candidates are the best plan until then and two
-    pulses, whose heights and lengths are random numbers of all magnitudes. Most pulses begin early,
-    since the next action cannot be mended later.
+    keep the limits of costs come first; those come last in which a fault cuts the episode short.
+    The search begins with the best of the plan of the step before and what simple controllers would
+    do. Candidates are the best plan until then and two pulses, whose heights and lengths are random
+    numbers of all magnitudes. Most pulses begin early, since the next action cannot be mended
+    later.
 
     The controller sees what an agent sees. Nine copies get the same actions as the environment.
     They differ in the parameters that the task draws, and the one whose observations fit best is
@@ -69,7 +74,8 @@ class MPC(Controller):
         candidates: How many candidates play in a decision.
         rounds: How often the search goes on from the best one in a decision.
         warm: A controller whose actions are a candidate, too, bound to nothing else. By default
-            those that the task file declares; ranges in them have their middle.
+            those that the task file declares and that fit the actions; ranges in them have their
+            middle.
         correction: By which part the offsets follow the differences in a step, from 0 to 1.
         budget: How long a decision may take, in seconds of real time, if the FMU cannot save its
             state; None for any time.
@@ -142,7 +148,9 @@ class MPC(Controller):
         self._plan_shape = steps, self._low.size
         make = self._model_of()
         self._many = max(COPIES, self.candidates // self.rounds)
-        self._copies = FMUVectorEnv(make, self._many, autoreset_mode="Disabled")
+        self._copies = FMUVectorEnv(
+            partial(_that_goes_on, make), self._many, autoreset_mode="Disabled"
+        )
         self._prototype = self._copies.inside.prototype
         future = self._prototype.inside.future or Future({}, (), float)
         for name in self.states:
@@ -200,9 +208,19 @@ class MPC(Controller):
 
     def _bound_warm(self) -> list[Controller]:
         """The simple controllers, bound to the copies."""
+        if self.warm is not None:
+            return [self.warm.bind(self._copies, self.names)]
         declared = self._prototype.inside.controllers or list
-        found = declared() if self.warm is None else [self.warm]
-        return [one.bind(self._copies, self.names) for one in found]
+        return [one for one in declared() if self._fits(one)]
+
+    def _fits(self, controller: Controller) -> bool:
+        """Bind a declared controller; tell whether it fits, unlike one for a single action."""
+        try:
+            controller.bind(self._copies, self.names)
+        except ConfigError as error:
+            self._prototype.logger.info("no plan begins with a controller of the task: %s", error)
+            return False
+        return True
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if mask.all():
@@ -294,7 +312,10 @@ class MPC(Controller):
             if episode.have_ended:
                 return
             sources = np.where(terminated | truncated, goes_on[0], np.arange(self._many))
-            episode.snapshot = copied.save_state()[sources]
+            saved = copied.save_state(goes_on)  # those that have failed cannot be saved
+            episode.snapshot = saved[np.searchsorted(goes_on, sources)]
+            if len(goes_on) < self._many:
+                copied.restore_state(episode.snapshot)
         episode.seen = np.asarray(observations, np.float64)[sources]
         off = (row - episode.seen) * episode.is_measured
         episode.observer.follow(off, sources)
@@ -386,13 +407,20 @@ class MPC(Controller):
         limits: Mapping[str, float],
         plans: FloatArray,
     ) -> _Plan:
-        """The best of some plans; whatever goes beyond the limit of a cost counts far more."""
+        """The best of some plans; whatever goes beyond the limit of a cost counts far more.
+
+        Plans in which a copy fails come last. What they have not paid for until their horizon would
+        make them look good.
+        """
         found = self._copies.rollout(start, self._actions(plans), **assumed)
         values: FloatArray = found.rewards.sum(axis=1)
         for name, limit in limits.items():
             if name in found.costs:
                 excess = np.maximum(found.costs[name].sum(axis=1) - limit, 0.0)
                 values = values - _PENALTY * excess
+        is_cut = found.has_failed & found.truncated.any(axis=1)
+        lacks = self._plan_shape[0] + 1 - found.lengths
+        values = np.where(is_cut, -_FAILURE * lacks, values)
         place = int(values.argmax())
         costs = {name: float(paid[place, 0]) for name, paid in found.costs.items()}
         return _Plan(float(values[place]), plans[place], costs)
@@ -562,6 +590,14 @@ class _Foresight:
             values = np.array([before, row])[:, places[0]] if places else [self._means[name]] * 2
             found[name] = [now - self._time_step, now], values
         return found
+
+
+def _that_goes_on(make: Callable[[], Any]) -> Any:
+    """An environment in which faults end episodes, but no decision."""
+    env = make()
+    if env.config.on_fault == "raise":
+        env.config = replace(env.config, on_fault="truncate")
+    return env
 
 
 def _pairs(states: Mapping[str, str] | str | None) -> dict[str, str]:

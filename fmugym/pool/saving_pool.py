@@ -207,7 +207,7 @@ class SavingPool(RetryingPool):
         for step in range(max((len(record.inputs) for record, _ in records), default=0)):
             skip[:] = True
             for record, index in records:
-                if step < len(record.inputs):
+                if step < len(record.inputs) and self.statuses[index] <= WARNING_CODE:
                     inputs[:, index], skip[index] = record.inputs[step], False
             self.step(inputs, skip)
 

@@ -57,9 +57,11 @@ class Rollout(_Steps):
         lengths: The steps that each candidate has done, shape (n,).
         costs: The numbers that infos tell as ``"costs"``, by name, each of shape (n, horizon); 0
             after the end.
+        has_failed: Whether a fault has ended the episode, shape (n,).
     """
 
     costs: Mapping[str, FloatArray] = MappingProxyType({})
+    has_failed: MaskArray
 
     @classmethod
     def of(
@@ -69,6 +71,7 @@ class Rollout(_Steps):
         terminated: MaskArray,
         truncated: MaskArray,
         costs: Mapping[str, FloatArray],
+        has_failed: Any = False,
     ) -> Rollout:
         """Make it of arrays with steps on the first axis."""
         ends = terminated | truncated
@@ -79,6 +82,7 @@ class Rollout(_Steps):
         runs = np.arange(horizon)[:, np.newaxis] < lengths
         found = cls(turned, rewards.T, terminated.T, truncated.T, lengths)
         found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
+        found.has_failed = np.broadcast_to(has_failed, lengths.shape)
         return found
 
 
@@ -118,6 +122,7 @@ def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
         name: np.concatenate([one.costs.get(name, 0.0 * one.rewards) for one in parts])[:count]
         for name in _names(one.costs for one in parts)
     }
+    joined.has_failed = np.concatenate([one.has_failed for one in parts])[:count]
     return joined
 
 
@@ -352,13 +357,14 @@ def roll_out_by_steps(
         horizon: The number of steps.
         observations: The observations before the first step.
     """
-    over = np.zeros(len(engine.ended), np.bool_)
+    over, has_failed = np.zeros((2, len(engine.ended)), np.bool_)
     results: list[StepResult] = []
     for step in range(horizon):
         resting = over.copy() if np.count_nonzero(over) else None
         result = engine.step(act(step, observations), None, resting)
         if resting is not None:
             result = _without(result, observations, resting)
+        has_failed |= result.infos.get("_fault", False) & ~over
         over |= result.terminated | result.truncated
         observations = result.observations
         results.append(result)
@@ -367,7 +373,7 @@ def roll_out_by_steps(
         lambda *arrays: np.stack(arrays), *(result[:4] for result in results)
     )
     paid = {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in _names(costs)}
-    return Rollout.of(seen, rewards, terminated, truncated, paid)
+    return Rollout.of(seen, rewards, terminated, truncated, paid, has_failed)
 
 
 def _without(result: StepResult, before: Any, over: MaskArray) -> StepResult:

@@ -5,6 +5,7 @@ import re
 from functools import partial
 
 import gymnasium
+import makers
 import numpy as np
 import pytest
 from test_assumed_rollouts import DT, HOUR, WHEEL
@@ -16,6 +17,7 @@ from fmugym.baselines.mpc import _Foresight
 from fmugym.baselines.observer import spread
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.task.future import Future, Lookup
 
 CALM = np.zeros(24)
@@ -506,3 +508,58 @@ class TestCommandLine:
         table = {"period": "1h", "controller": "mpc horizon=1h"}
         with pytest.raises(ConfigError, match="none of in a warm-up"):
             env_of(wheel(warm_up=table))
+
+
+@pytest.fixture(scope="module")
+def fragile(tmp_path_factory):
+    return makers.by_python("pythonfmu", "foreign_fragile.py")(tmp_path_factory.mktemp("fmu"))
+
+
+class TestFailures:
+    """Beyond a limit, the FMU fails and each step up to it is paid for."""
+
+    def env(self, fragile, limit, on_fault):
+        facts = {
+            "fmu": str(fragile),
+            "time_step": 0.1,
+            "episode_length": "1s",
+            "agent": {"actions": ["u"], "observations": ["y"]},
+            "variables": {"u": {"min": -1, "max": 1}},
+            "parameters": {"limit": limit},
+            "config": {"on_fault": on_fault},
+            "reward": "-abs(y - 1)",
+        }
+        return fmugym.load(fmugym.Task.from_dict(facts))
+
+    @pytest.mark.parametrize("on_fault", ["truncate", "raise"])
+    @pytest.mark.parametrize(
+        "limit",
+        [0.55, {"distribution": "uniform", "low": 0.2, "high": 0.9}],
+        ids=["known", "drawn"],
+    )
+    def test_no_plan_fails_and_no_copy_that_has_is_planned_on(self, fragile, limit, on_fault):
+        env = self.env(fragile, limit, on_fault)
+        mpc = MPC("0.8s", candidates=36, budget=None).bind(env)
+        true = 0.9 if isinstance(limit, dict) else limit
+        observation, _ = env.reset(seed=0, options={"model_parameters": {"limit": true}})
+        for step in range(10):
+            action = mpc.act(observation)
+            statuses = mpc._copies.inside.pool.statuses
+            assert statuses.size == 9
+            assert (statuses <= WARNING_CODE).all()
+            observation, _, _, truncated, info = env.step(action)
+            assert "fault" not in info
+            assert truncated == (step == 9)
+        assert 0.4 < observation.item() <= true
+        mpc.close()
+        env.close()
+
+    def test_a_rollout_tells_which_candidates_fail(self, fragile):
+        envs = fmugym.FMUVectorEnv(lambda: self.env(fragile, 0.55, "truncate"), 3)
+        envs.reset(seed=0)
+        speeds = np.array([1.0, -1.0, 0.5, 0.9, 0.0, 0.8, 1.0])
+        actions = np.repeat(speeds[:, np.newaxis, np.newaxis], 10, axis=1)
+        found = envs.rollout(envs.save_state([0]), actions)
+        assert found.has_failed.tolist() == (speeds > 0.55).tolist()
+        assert (found.lengths < 10).tolist() == found.has_failed.tolist()
+        envs.close()
