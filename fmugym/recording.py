@@ -33,6 +33,7 @@ from gymnasium.utils.seeding import np_random
 from fmugym.checks import check_seed, require_regular
 from fmugym.env import inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.files import replaced
 from fmugym.signals import ordinary
 from fmugym.task.saving import generator_of, row_of, state_of
 from fmugym.task.snapshot import require_scope, scope_of
@@ -120,7 +121,7 @@ class Recording:
         fields = {name: getattr(self, name) for name in _ARRAYS}
         header = {name: getattr(self, name) for name in FACTS}
         text = json.dumps({"version": _VERSION, **header}).encode()
-        with Path(path).open("wb") as file:
+        with replaced(Path(path)) as part, part.open("wb") as file:
             np.savez_compressed(file, header=np.frombuffer(text, np.uint8), **fields)
 
     @classmethod

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,8 @@ FloatArray = npt.NDArray[np.float64]
 
 MOST_CORRELATED: Final = 200
 """More numbers than these are searched without covariances."""
+
+_STATE: Final = ("mean", "sigma", "_limits", "_covariance", "_root", "_paths")
 
 
 class CMA:
@@ -66,6 +69,25 @@ class CMA:
         rate = speed * 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)
         self._rate_many = min(1 - self._rate_one, rate)
         self._usual_length = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
+
+    def state(self) -> dict[str, Any]:
+        """What the next round follows from: numbers and arrays by name."""
+        return {"population": self._shape[0], **{name: getattr(self, name) for name in _STATE}}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state of a search with as many numbers and candidates.
+
+        Raises:
+            KeyError: If something is missing.
+            TypeError, ValueError: If something has another form.
+        """
+        for name in _STATE:
+            now, given = np.asarray(getattr(self, name)), np.asarray(state[name], np.float64)
+            if given.shape != now.shape or np.isnan(given).any():
+                raise ValueError(f"{name} has the shape {given.shape}, expected {now.shape}")
+            setattr(self, name, given if given.ndim else float(given))
+        if not self.sigma > 0.0:
+            raise ValueError(f"sigma is {self.sigma}")
 
     def ask(self) -> FloatArray:
         """Draw the candidates of a round, shape (population, n).

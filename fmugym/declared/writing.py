@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, shown
+from fmugym.files import write_whole
 from fmugym.signals import ordinary
 
 __all__ = ["as_toml", "revised", "write_new"]
@@ -23,13 +24,18 @@ _TABLES: Final = (("plant", "tags"), ("plant", "data"))
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a text to a new file.
+    """Write a text to a new file; nothing stays of one that cannot be completed.
 
     Raises:
         FileExistsError: If the file exists.
     """
-    with path.open("x", encoding="utf-8", newline="\n") as file:
-        file.write(text)
+    with path.open("x", encoding="utf-8", newline="\n"):
+        pass
+    try:
+        write_whole(path, text.encode())
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def as_toml(document: Mapping[str, Any]) -> str:

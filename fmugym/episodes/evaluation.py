@@ -18,6 +18,7 @@ from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import plain
 from fmugym.extras import imported
+from fmugym.files import replaced
 from fmugym.series.intervals import confidence
 
 __all__ = [
@@ -273,7 +274,8 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     axes[0].set_yticks(range(len(scores)), list(map(_shortened, _labels(scores))))
     axes[0].invert_yaxis()
     figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-    figure.savefig(path, dpi=150)
+    with replaced(path) as part:
+        figure.savefig(part, dpi=150)
 
 
 def _worth_drawing(scores: Sequence[Score]) -> Sequence[Score]:

@@ -28,6 +28,7 @@ from fmugym.checks import (
     require_regular,
 )
 from fmugym.errors import ConfigError, reading, shown
+from fmugym.files import write_whole
 from fmugym.search.flattening import choices_of, rows_of
 from fmugym.signals import Ignoring
 
@@ -167,8 +168,11 @@ class Agent:
 
     def save(self, folder: Path) -> None:
         """Write the agent to a folder; a file that is there is replaced."""
-        text = json.dumps(asdict(self), default=np.ndarray.tolist)
-        (folder / AGENT).write_text(text, encoding="utf-8")
+        write_whole(folder / AGENT, self.content())
+
+    def content(self) -> bytes:
+        """The content of its file."""
+        return json.dumps(asdict(self), default=np.ndarray.tolist).encode()
 
     @classmethod
     def load(cls, folder: Path) -> Self:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from typing import Any, Final
@@ -88,13 +88,17 @@ class Search:
         steps: Those of all environments until the search was last saved.
         controllers: Those to be beaten.
         baseline: The best one of them, once it is known.
+        policies: The classes of policies, once they have entered.
+        rng: Draws all random numbers.
+        scale: What observations are like; see ``scale_of``.
+        widths: Of the looks that are still to come, how many numbers each draws.
     """
 
     def __init__(self, probe: Probe, seed: int) -> None:
         self.probe, self.seed = probe, seed
         self.episodes = 1 if probe.is_same else _EPISODES
         self.rounds, self.steps = 0, MOST_PROBED
-        self._rng = np.random.default_rng(seed)
+        self.rng = np.random.default_rng(seed)
         self.controllers = [
             Entrant(None, one, self.episodes, rounds=_TUNING, best=one)
             if one.is_found
@@ -102,14 +106,23 @@ class Search:
             for one in probe.agents
         ]
         self.baseline: Any = None
-        self._policies: list[Entrant] = []
-        self._scale = probe.linear.scale
-        self._widths = [probe.linear.size, probe.linear.acting]
+        self.policies: list[Entrant] = []
+        self.scale = probe.linear.scale
+        self.widths = [probe.linear.size, probe.linear.acting]
+
+    @property
+    def random_state(self) -> Mapping[str, Any]:
+        """Where the random numbers are: integers and texts by name."""
+        return dict(self.rng.bit_generator.state)
+
+    @random_state.setter
+    def random_state(self, state: Mapping[str, Any]) -> None:
+        self.rng.bit_generator.state = state
 
     @property
     def is_over(self) -> bool:
         """Whether nothing more is gained."""
-        return not self._widths and not self._active
+        return not self.widths and not self._active
 
     @property
     def tuning(self) -> Entrant | None:
@@ -122,12 +135,12 @@ class Search:
     @property
     def _active(self) -> list[Entrant]:
         """The classes of policies that have not gone."""
-        return [one for one in self._policies if one.starts < _STARTS]
+        return [one for one in self.policies if one.starts < _STARTS]
 
     @property
     def ahead(self) -> Entrant:
         """Who has the best agent in validation."""
-        return max(self.controllers + self._policies, key=_MERIT)
+        return max(self.controllers + self.policies, key=_MERIT)
 
     # Rounds.
 
@@ -135,7 +148,7 @@ class Search:
         """Go on by one round, or by one that tells what observations are like."""
         if self.tuning:
             self._play(self.tuning, arena)
-        elif self._widths:
+        elif self.widths:
             if self.baseline is None:
                 for one in self.controllers:
                     if one.cma is None:
@@ -167,11 +180,11 @@ class Search:
         leader.gained = leader.rounds
         if leader.then is not None:
             (start,) = leader.then.extended(leader.best.weights[None])
-            self._policies.append(self._entrant(leader.then.with_numbers(start)))
+            self.policies.append(self._entrant(leader.then.with_numbers(start)))
             leader.then = None
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
-        entrant.play(arena, self._rng.integers(VALIDATION, size=entrant.episodes).tolist())
+        entrant.play(arena, self.rng.integers(VALIDATION, size=entrant.episodes).tolist())
         self.rounds += 1
         entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
@@ -186,7 +199,7 @@ class Search:
     def _entrant(self, agent: Agent, then: Agent | None = None) -> Entrant:
         if has_range(agent.text):
             ranges = search_of(agent.text).ranges
-            return entrant_of(agent, ranges, (_MANY, FEW), self.episodes, self._rng)
+            return entrant_of(agent, ranges, (_MANY, FEW), self.episodes, self.rng)
         return Entrant(self._cma(agent), agent, self.episodes, then)
 
     def _cma(self, agent: Agent) -> CMA:
@@ -194,7 +207,7 @@ class Search:
         mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
         sigma = _OF_NETWORKS if agent.hidden else _OF_CORRECTIONS if agent.text else 1.0
         population = _MANY if agent.observed else FEW
-        return CMA(mean, sigma, population, self._rng, largest=_LARGEST, growth=_GROWTH)
+        return CMA(mean, sigma, population, self.rng, largest=_LARGEST, growth=_GROWTH)
 
     def _look(self, arena: Arena, baseline: Agent) -> None:
         """See what observations are like for the best of some candidates that correct the baseline.
@@ -205,30 +218,30 @@ class Search:
         tell the scale anew. Then classes of policies enter.
         """
         history = replace(self.probe.linear, name="linear with history", history=True)
-        agent = replace(history, text=baseline.text, scale=self._scale)
+        agent = replace(history, text=baseline.text, scale=self.scale)
         sizes = np.geomspace(1.0, _FINEST, _RANDOM)[:, None]
-        drawn = self._rng.standard_normal((_RANDOM, self._widths.pop()))
+        drawn = self.rng.standard_normal((_RANDOM, self.widths.pop()))
         rows = agent.extended(sizes * drawn)
-        seeds = self._rng.integers(VALIDATION, size=self.episodes).tolist()
+        seeds = self.rng.integers(VALIDATION, size=self.episodes).tolist()
         outcome = arena.play(agent, rows, seeds, has_moments=True)
         self.rounds += 1
         best = outcome.moments[outcome.order[: _RANDOM // _BEST_PART]]
-        self._scale = scale_of(best.sum(axis=(0, 1)))
-        if not self._widths:
+        self.scale = scale_of(best.sum(axis=(0, 1)))
+        if not self.widths:
             self._enter(history, baseline)
 
     def _enter(self, history: Agent, baseline: Agent) -> None:
         """Let classes of policies enter. Linear ones are followed by those that see the past."""
         linear = self.probe.linear
         *linear_ones, network = (
-            replace(one, scale=self._scale[:, : one.features])
+            replace(one, scale=self.scale[:, : one.features])
             for one in (linear, history, replace(linear, name="network", hidden=16))
         )
         for text in dict.fromkeys((baseline.text, None)):
             prefix = f"{baseline.name} + " if text else ""
             pair = (replace(one, name=prefix + one.name, text=text) for one in linear_ones)
-            self._policies.append(self._entrant(*pair))
-        self._policies.append(self._entrant(network))
+            self.policies.append(self._entrant(*pair))
+        self.policies.append(self._entrant(network))
 
     # Who wins.
 
@@ -242,7 +255,7 @@ class Search:
         agents, searches = [], self.controllers
         if self.baseline:
             agents.append(self.baseline.best)
-            searches = sorted(self._policies, key=_MERIT, reverse=True)[:2]
+            searches = sorted(self.policies, key=_MERIT, reverse=True)[:2]
         for one in searches:
             if one.best:
                 agents.append(one.best)

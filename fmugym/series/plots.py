@@ -18,6 +18,7 @@ import numpy as np
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
+from fmugym.files import replaced
 from fmugym.series.timeseries import TimeSeries
 from fmugym.signals import ordinary
 from fmugym.task.quantity import Quantity
@@ -127,7 +128,8 @@ def plot(series: TimeSeries, path: str | os.PathLike[str] | None = None, title: 
     if path is not None:
         file = check_path("the path of a picture", path)
         try:
-            figure.savefig(file, dpi=150)
+            with replaced(file) as part:
+                figure.savefig(part, dpi=150)
         except ordinary(ValueError) as error:  # of Matplotlib, for a format that it does not know
             raise ConfigError(f"no picture can be written: {error}") from None
     return figure

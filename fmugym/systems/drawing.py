@@ -8,6 +8,7 @@ from typing import Any, Final
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, printable, reason
 from fmugym.extras import imported
+from fmugym.files import replaced
 from fmugym.signals import ordinary
 from fmugym.systems.placing import Box, Picture, Wire, picture_of
 from fmugym.systems.wired import WiredSystem
@@ -46,7 +47,8 @@ def draw(system: WiredSystem, path: str | os.PathLike[str] | None = None) -> Any
         if path is not None:
             file = check_path("the path of a picture", path)
             try:
-                figure.savefig(file, dpi=150, metadata=_metadata(file.suffix))
+                with replaced(file) as part:
+                    figure.savefig(part, dpi=150, metadata=_metadata(file.suffix))
             except ordinary(ValueError, OSError) as error:  # of the format or the folder
                 raise ConfigError(f"no picture can be written: {reason(error)}") from None
     return figure

@@ -13,6 +13,7 @@ from fmugym.episodes.evaluation import aligned
 from fmugym.episodes.output_files import require_picture
 from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
+from fmugym.files import replaced
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison
 from fmugym.identification.clock_shift import Shift, shift_of_clocks
@@ -118,7 +119,8 @@ def _fit(arguments: argparse.Namespace) -> None:
         write_rows(fit, rows)
         write_extension(output, arguments.task, {"fitted": rows.name})
     if arguments.plot is not None:
-        plot_comparison(fit.comparison).savefig(arguments.plot)
+        with replaced(arguments.plot) as part:
+            plot_comparison(fit.comparison).savefig(part)
     _show(fit, arguments)
 
 

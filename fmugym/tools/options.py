@@ -22,7 +22,7 @@ from fmugym.episodes.progress_bars import quiet
 from fmugym.episodes.simulation import Player, action_of, policy_of
 from fmugym.errors import ConfigError, plain, shown
 from fmugym.systems.system_plan import MASTERS
-from fmugym.training.agents import agent_player
+from fmugym.training.agents import FACTS, agent_player
 
 __all__ = [
     "HELP_OF_TASK",
@@ -65,7 +65,7 @@ MINARI: Final = "minari:"
 _FILES: Final = ("output", "plot")
 """Options that name files or folders to write."""
 
-_OF_TRAININGS: Final = ("agent.json", "evaluations.csv", "search.pkl", "training.json")
+_OF_TRAININGS: Final = ("agent.json", "evaluations.csv", "search.npz", "training.json")
 """Files by which a folder is known to be that of a training, so that ``--force`` replaces it."""
 
 EXAMPLES: Final = {
@@ -306,12 +306,14 @@ def speaking(arguments: argparse.Namespace) -> Iterator[None]:
 def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
     """Refuse files that exist before work is done for them; ``--force`` replaces them.
 
-    An old file comes back if the command ends without a new one.
+    An old file comes back if the command ends without a new one, or with one that an error, such as
+    a full disk, has left incomplete.
 
     Raises:
         ConfigError: If a file exists, or its folder does not.
     """
     old: dict[Path, Path] = {}
+    has_failed = False
     paths = [] if getattr(arguments, "resume", False) else list(_outputs_of(arguments))
     for path in paths:
         _require_free(path, arguments.force)
@@ -319,14 +321,28 @@ def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
         for path in filter(_is_replaceable, paths):
             old[path] = path.rename(path.with_name(f".{path.name}.{os.getpid()}"))
         yield
+    except BaseException as error:
+        has_failed = not isinstance(error, KeyboardInterrupt)
+        raise
     finally:
         for path, aside in old.items():
-            if not path.exists():
+            if not _is_complete(path, has_failed):
+                _remove(path)
                 aside.rename(path)
-            elif aside.is_dir():
-                shutil.rmtree(aside)
             else:
-                aside.unlink()
+                _remove(aside)
+
+
+def _is_complete(path: Path, has_failed: bool) -> bool:
+    """Whether there is a new file; what is in the folder of a training is complete at any time."""
+    return (path / FACTS).exists() if path.is_dir() else path.exists() and not has_failed
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _require_free(path: Path, is_forced: bool) -> None:

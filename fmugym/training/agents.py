@@ -21,6 +21,7 @@ from fmugym.env import FMUEnv
 from fmugym.episodes.simulation import Player, Policy, policy_of_controller
 from fmugym.errors import ConfigError, reading, shown
 from fmugym.extras import imported
+from fmugym.files import replaced_together
 from fmugym.scaling import are_scaled, unscaled
 from fmugym.search.policy import AGENT, Agent, require_task
 from fmugym.signals import ordinary
@@ -36,7 +37,6 @@ __all__ = [
     "read_agent",
     "read_facts",
     "save",
-    "write_whole",
 ]
 
 _LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
@@ -73,23 +73,17 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
     """Write an agent to a folder.
 
     Args:
-        folder: The folder; an agent that is there is replaced.
+        folder: The folder; an agent that is there is replaced once this one is complete.
         model: The model of Stable-Baselines3.
         normalization: A ``VecNormalize``, or None.
         facts: What to tell about the agent, ``algorithm`` at least, and for ``bind`` the names of
             its ``observations`` and ``actions``.
     """
-    model.save(folder / _MODEL)
-    if normalization is not None:
-        normalization.save(str(folder / _NORMALIZATION))
-    write_whole(folder / FACTS, json.dumps(dict(facts)).encode())
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """Write a file; the one before stays until this one is complete."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(content)
-    part.replace(path)
+    with replaced_together() as beside:
+        model.save(beside(folder / _MODEL))
+        if normalization is not None:
+            normalization.save(str(beside(folder / _NORMALIZATION)))
+        beside(folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
 
 
 def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:

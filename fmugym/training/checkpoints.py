@@ -19,7 +19,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import FMUGymError, reading, shown
-from fmugym.training.agents import algorithm_of, read_facts, write_whole
+from fmugym.files import write_whole
+from fmugym.training.agents import algorithm_of, read_facts
 
 __all__ = [
     "CHECKPOINT",
@@ -44,9 +45,30 @@ def save_checkpoint(folder: Path, model: Any, venv: Any, more: dict[str, Any]) -
         venv: Its environments: wrappers around a ``FMUVecEnv``.
         more: What else to keep; it must be possible to pickle it.
     """
-    place = folder / f"checkpoint-{int(model.num_timesteps)}"
+    place = _new_place(folder, int(model.num_timesteps))
+    try:
+        _write(place, model, venv, more)
+    except BaseException:  # such as a full disk
+        shutil.rmtree(place, ignore_errors=True)
+        raise
+    facts = {"folder": place.name, "steps": int(model.num_timesteps)}
+    write_whole(folder / CHECKPOINT, json.dumps(facts).encode())
+    for old in folder.glob("checkpoint-*"):
+        if old != place:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _new_place(folder: Path, steps: int) -> Path:
+    """A new folder; there may be a checkpoint of the same step."""
+    names = (f"checkpoint-{steps}{suffix}" for suffix in ("", "-again"))
+    now = latest_checkpoint(folder)[0].name if (folder / CHECKPOINT).exists() else None
+    place = next(folder / name for name in names if name != now)
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
+    return place
+
+
+def _write(place: Path, model: Any, venv: Any, more: dict[str, Any]) -> None:
     model.save(place / "model.zip")
     if getattr(model, "replay_buffer", None) is not None:
         model.save_replay_buffer(place / "replay.pkl")
@@ -54,11 +76,6 @@ def save_checkpoint(folder: Path, model: Any, venv: Any, more: dict[str, Any]) -
     state["random"] = _random_states(venv)
     with (place / "state.pkl").open("wb") as file:
         pickle.dump(state, file)
-    facts = {"folder": place.name, "steps": int(model.num_timesteps)}
-    write_whole(folder / CHECKPOINT, json.dumps(facts).encode())
-    for old in folder.glob("checkpoint-*"):
-        if old != place:
-            shutil.rmtree(old, ignore_errors=True)
 
 
 def _layers(venv: Any) -> list[Any]:

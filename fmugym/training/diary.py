@@ -13,6 +13,7 @@ from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
+from fmugym.files import replaced
 from fmugym.series import RecordSeries, RecordVectorSeries
 from fmugym.series.plots import COLOURS, drawing_style
 from fmugym.vector import FMUVectorEnv
@@ -110,10 +111,11 @@ def note(folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVA
         name: That of the file.
     """
     path = folder / name
-    is_new = not path.exists()
-    with path.open("a", encoding="utf-8", newline="") as file:
+    before = path.read_text(encoding="utf-8") if path.exists() else ""
+    with replaced(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        file.write(before)
         writer = csv.writer(file, lineterminator="\n")
-        if is_new:
+        if not before:
             writer.writerow(names)
         writer.writerow(row)
 

@@ -13,6 +13,7 @@ from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.episodes.output_files import About
 from fmugym.episodes.simulation import simulate
 from fmugym.errors import ConfigError
+from fmugym.files import replaced
 from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.plots import svg_of
 from fmugym.training.agents import FACTS, agent_player
@@ -55,7 +56,8 @@ def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
     except ConfigError as error:
         tell(f"there is no picture of the training: {error}")
         return None
-    figure.savefig(folder / CURVE, dpi=100)
+    with replaced(folder / CURVE) as part:
+        figure.savefig(part, dpi=100)
     return figure
 
 
@@ -77,17 +79,16 @@ def _write_report(
         "environments": str(settings.num_envs),
         "steps of the best agent": str(best["steps"]),
     }
-    path = settings.folder / REPORT
-    path.unlink(missing_ok=True)
-    write_report(
-        path,
-        runs,
-        title=f"{title}: the best agent of a training",
-        description=about.description,
-        facts={**about.facts, **facts},
-        text=about.text,
-        charts=charts,
-    )
+    with replaced(settings.folder / REPORT) as part:
+        write_report(
+            part,
+            runs,
+            title=f"{title}: the best agent of a training",
+            description=about.description,
+            facts={**about.facts, **facts},
+            text=about.text,
+            charts=charts,
+        )
 
 
 def _played(settings: TrainingSettings, diary: Diary, make_env: Callable[[], FMUEnv]) -> TimeSeries:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 import json
-import pickle
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -19,18 +19,20 @@ from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reading, shown
-from fmugym.search.policy import Agent
+from fmugym.files import replaced_together
+from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
+from fmugym.search.search_file import bytes_of, plain_of, search_in
 from fmugym.signals import Ignoring
-from fmugym.training.agents import FACTS, write_whole
+from fmugym.training.agents import FACTS
 from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
 from fmugym.training.training import require_new
 
 __all__ = ["STATE", "Searching"]
 
-STATE: Final = "search.pkl"
+STATE: Final = "search.npz"
 _MINUTES: Final = 1.0
 _FEWEST: Final = 20
 """Rounds for controllers that must fit the time, so that policies are searched, too."""
@@ -132,17 +134,16 @@ class Searching:
         return Search(probe, self.seed)
 
     def _resumed(self) -> Search:
-        """Read the state of a search; it is a pickle, which can run code.
+        """Read the state of a search.
 
         Raises:
             ConfigError: If there is none, it is damaged, or it is of another task.
         """
         name = shown(str(self.folder))
         with reading(f"{name} has no search to resume"):
-            found: Search = pickle.loads((self.folder / STATE).read_bytes())
-            before, _ = found.probe.task, found.is_over  # one of another version lacks something
+            found = search_in((self.folder / STATE).read_bytes())
         with closing(self.make_env()) as env:
-            now = task_of(env)
+            before, now = plain_of(found.probe.task), plain_of(task_of(env))
         changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
         if changed:
             raise ConfigError(
@@ -213,7 +214,7 @@ class Searching:
         while not self._is_over(longest):
             begin, before = monotonic(), self._found
             self._arena.ceiling = self.steps - self._reserved(before)
-            found = pickle.loads(pickle.dumps(before))
+            found = copy.deepcopy(before)
             try:
                 found.advance(self._arena)
             except CeilingError:
@@ -257,7 +258,6 @@ class Searching:
         """Write an agent, its facts, and the state of the search."""
         found, task = self._found, self._probe.task
         found.steps = self._arena.steps
-        replace(agent, names=task["observations"], actions=task["actions"]).save(self.folder)
         facts = {
             "algorithm": "search",
             "agent": agent.name,
@@ -268,8 +268,11 @@ class Searching:
             "steps": found.steps,
             **more,
         }
-        write_whole(self.folder / FACTS, json.dumps(facts).encode())
-        write_whole(self.folder / STATE, pickle.dumps(found))
+        named = replace(agent, names=task["observations"], actions=task["actions"])
+        with replaced_together() as beside:
+            beside(self.folder / AGENT).write_bytes(named.content())
+            beside(self.folder / STATE).write_bytes(bytes_of(found))
+            beside(self.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
         return facts
 
     def _judged(self, winner: Agent) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from fmugym.episodes.evaluation import (
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.episodes.simulation import Player
 from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.files import write_whole
 from fmugym.scaling import can_be_scaled
 from fmugym.signals import ordinary
 from fmugym.training.agents import (
@@ -40,7 +41,6 @@ from fmugym.training.agents import (
     policy_with,
     read_facts,
     save,
-    write_whole,
 )
 from fmugym.training.checkpoints import (
     NOTHING_TO_RESUME,
@@ -495,4 +495,4 @@ def _drop_rows(path: Path, steps: int) -> None:
     if path.exists():
         header, *rows = path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [row for row in rows if int(row.partition(",")[0]) <= steps]
-        path.write_text("".join([header, *kept]), encoding="utf-8")
+        write_whole(path, "".join([header, *kept]).encode())

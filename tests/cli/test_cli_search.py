@@ -11,6 +11,7 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from functools import partial
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from fmugym.search.search import Search
 from fmugym.series.intervals import confidence
 from fmugym.tools.cli import main
 from fmugym.training.comparing import verdict
+from fmugym.training.searching import Searching
 
 TASK = {
     "fmu": {"bundled": "Pendulum"},
@@ -144,6 +146,43 @@ def whole(tmp_path_factory):
     return path / "whole", out.getvalue()
 
 
+class Trap:
+    """Its pickle runs code."""
+
+    opened: ClassVar[list[str]] = []
+
+    def __reduce__(self):
+        return Trap.opened.append, ("opened",)
+
+
+def npz(**arrays):
+    """The content of an archive of arrays."""
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def text_of(facts):
+    return np.frombuffer(json.dumps(facts).encode(), np.uint8)
+
+
+POSSIBLE = {"task": [{"a": 1}], "limits": [{"a": 1}], "name": ["nonsense"], "actions": ["nonsense"]}
+
+
+def mistakes(facts):
+    """The facts of a search, each time with something else missing or of another kind."""
+    policy, controller = facts["policies"][0], facts["controllers"][0]
+    for part in (facts, facts["linear"], policy, controller, policy["make"], policy["cma"]):
+        for name, value in list(part.items()):
+            for wrong in ({"a": 1}, "nonsense", -1.5):
+                part[name] = wrong
+                if wrong not in POSSIBLE.get(name, ()):
+                    yield facts
+            del part[name]
+            yield facts
+            part[name] = value
+
+
 class TestCourse:
     def test_rounds_repeat_a_search_and_its_output(self, whole, task, tmp_path, searched):
         folder, told = whole
@@ -223,13 +262,38 @@ class TestCourse:
             assert (code, out, err.count("\n")) == (1, "", 1), options
             assert fact in err
         assert content(folder) == before
-        state = folder / "search.pkl"
-        of_another_version = pickle.loads(state.read_bytes())
-        del of_another_version._widths
-        for damaged in (b"broken", pickle.dumps(of_another_version)):
-            state.write_bytes(damaged)
+
+    def test_nothing_in_its_file_could_run(self, whole, task, tmp_path, cli):
+        """It is an archive of numbers; a pickle in its place is not opened."""
+        assert [path.name for path in whole[0].glob("search.*")] == ["search.npz"]
+        with np.load(whole[0] / "search.npz", allow_pickle=False) as file:
+            assert {file[name].dtype.kind for name in file.files} == {"u", "f"}
+        folder = shutil.copytree(whole[0], tmp_path / "whole")
+        for content in (pickle.dumps(Trap()), npz(text=np.array([Trap()], dtype=object))):
+            (folder / "search.npz").write_bytes(content)
             code, _, err = cli("train", task, "--output", folder, "--resume")
             assert (code, "no search to resume" in err) == (1, True)
+        assert not Trap.opened
+
+    def test_a_damaged_file_is_one_error(self, whole, task, tmp_path, cli):
+        folder = shutil.copytree(whole[0], tmp_path / "whole")
+        state = folder / "search.npz"
+        good = state.read_bytes()
+        with np.load(state, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        facts = json.loads(arrays["text"].tobytes())
+        damaged = [b"", b"broken", good[: len(good) // 2], npz(text=np.zeros(3)), npz()]
+        damaged += [npz(**arrays | {"text": text_of(one)}) for one in mistakes(facts)]
+        name = facts["policies"][0]["cma"]["mean"]
+        for wrong in (arrays[name][:-1], arrays[name] * np.nan, arrays[name].astype("f4")):
+            damaged.append(npz(**arrays | {name: wrong}))
+        assert len(damaged) > 100
+        for content in damaged:
+            state.write_bytes(content)
+            with pytest.raises(fmugym.ConfigError, match="no search to resume"):
+                Searching(None, {}, folder)._resumed()
+        code, _, err = cli("train", task, "--output", folder, "--resume")
+        assert (code, err.count("\n")) == (1, 1)
 
     def test_an_interruption_before_anything_is_found(self, task, tmp_path, searched, monkeypatch):
         Interruption(monkeypatch, 0)

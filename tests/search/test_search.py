@@ -871,18 +871,18 @@ def test_a_search_that_gains_nothing_ends():
 
 
 def names_of(search):
-    found = [one.best for one in search._policies if one.gained]
+    found = [one.best for one in search.policies if one.gained]
     return [search.baseline.best.name, *(one.name for one in found)]
 
 
 def test_a_history_enters_when_a_correction_gains_nothing_without_it():
     search, field = search_of_agents(GIVEN), Field(1.0)
-    while not search._policies:
+    while not search.policies:
         search.advance(field)
-    first = search._policies[0]
+    first = search.policies[0]
     while first.rounds - first.gained < 14:
         search.advance(field)
-    assert [one.make.name for one in search._policies] == ["given + linear", "linear", "network"]
+    assert [one.make.name for one in search.policies] == ["given + linear", "linear", "network"]
     while "given + linear with history" not in names_of(search):
         search.advance(field)
     assert search.rounds < 300
@@ -900,7 +900,7 @@ def test_what_the_search_has_come_to_may_win_without_an_earlier_gain():
     search, field = search_of_agents(GIVEN), Late(1.0)
     while search.rounds < 60:
         search.advance(field)
-    leader = max(search._policies[:2], key=lambda one: one.cma.mean.sum())
+    leader = max(search.policies[:2], key=lambda one: one.cma.mean.sum())
     assert leader.best.weights.sum() < leader.cma.mean.sum()
     assert np.array_equal(search.winner(field).weights, leader.cma.mean)
 
@@ -915,7 +915,7 @@ def test_who_is_worse_than_the_baseline_has_no_more_than_its_share():
     search, field = search_of_agents(GIVEN), Uneven(1e9)
     for _ in range(200):
         search.advance(field)
-    rounds = {one.make.name: one.rounds for one in search._policies}
+    rounds = {one.make.name: one.rounds for one in search.policies}
     assert {rounds["linear"], rounds["network"]} <= {19, 20}
     assert rounds["given + linear"] + rounds.get("given + linear with history", 0) > 140
 
