@@ -59,11 +59,16 @@ def _is_of_handler(error: BaseException) -> bool:
 
 
 def _origins(error: BaseException) -> Iterator[BaseException]:
-    """An exception and those that it was made of, without those that callers are handling."""
+    """An exception and those that it was made of, without those that callers are handling.
+
+    Nor is it made of one that asks for an end, as Ctrl-C does: clean-ups have failed meanwhile.
+    """
     stack = error.__traceback__ and walk_stack(error.__traceback__.tb_frame)
     callers = [frame for frame, _ in stack or ()][1:]
     origin: BaseException | None = error
-    while origin and not (origin.__traceback__ and origin.__traceback__.tb_frame in callers):
+    while isinstance(origin, Exception) and not (
+        origin.__traceback__ and origin.__traceback__.tb_frame in callers
+    ):
         yield origin
         origin = origin.__cause__ or origin.__context__
 

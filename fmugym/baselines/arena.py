@@ -90,6 +90,7 @@ class Arena:
         ceiling: The largest number of steps.
         longest: The steps of the longest episode until now.
         infos: Those of the last step.
+        advance: Is told of each step, as a part of all that ``play`` has to do.
     """
 
     make_env: Callable[[], Any]
@@ -101,6 +102,7 @@ class Arena:
     seconds: float = 0.0
     ceiling: float = np.inf
     infos: Any = None
+    advance: Callable[[float], None] = lambda part: None
     _envs: FMUVectorEnv | None = None
 
     def close(self) -> None:
@@ -130,11 +132,8 @@ class Arena:
             CeilingError: If more steps are needed than there may be.
         """
         jobs = np.arange(len(numbers) * len(seeds))
-        size = min(len(jobs), self.most_envs)
-        if self._envs is None or self._envs.num_envs < size:
-            self.close()
-            self._envs = FMUVectorEnv(self.make_env, size)
-        envs, groups = self._envs, []
+        envs, groups = self.open(len(jobs)), []
+        self._part = 1 / -(-len(jobs) // envs.num_envs)  # of a group
         for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
             who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
             controller = make(numbers[who]).bind(envs)
@@ -146,6 +145,18 @@ class Arena:
         costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
         return Outcome(totals[0], costs, self.limits, moments)
 
+    def open(self, jobs: int) -> FMUVectorEnv:
+        """Make the environments for so many episodes, unless there are enough.
+
+        Raises:
+            ConfigError, FMULoadError, SimulationError: If they cannot be made.
+        """
+        size = min(jobs, self.most_envs)
+        if self._envs is None or self._envs.num_envs < size:
+            self.close()
+            self._envs = FMUVectorEnv(self.make_env, size)
+        return self._envs
+
     def _play(
         self, envs: FMUVectorEnv, controller: Any, seeds: list[int], count: int, has_moments: bool
     ) -> FloatArray:
@@ -156,6 +167,8 @@ class Arena:
         observations, infos = envs.reset(seed=seeds)
         totals: FloatArray = np.zeros(())
         running = np.arange(len(seeds)) < count
+        limit = min(self.most_steps, most_steps_of(envs.inside.prototype) or MOST_STEPS)
+        left = self._part
         for step in range(self.most_steps):
             count = int(np.count_nonzero(running))
             if not count:
@@ -177,4 +190,7 @@ class Arena:
             )
             totals = totals + np.where(running, np.stack(values), 0.0)
             running &= ~(terminated | truncated)
+            left -= self._part / limit
+            self.advance(self._part / limit)
+        self.advance(max(left, 0.0))
         return totals

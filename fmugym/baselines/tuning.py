@@ -96,6 +96,7 @@ def tune(
     most_steps: int = MOST_STEPS,
     seed: int = 0,
     watch: Callable[[Tuning], None] | None = None,
+    advance: Callable[[float], None] = lambda rounds: None,
 ) -> Tuning:
     """Find the numbers with which a controller gets the largest rewards.
 
@@ -116,6 +117,7 @@ def tune(
         most_steps: Steps after which an episode is stopped.
         seed: Of the candidates and of the episodes.
         watch: Gets the best candidate until now after each round.
+        advance: Is told of each step, as a part of a round.
 
     Returns:
         The best of all candidates, and how the search went.
@@ -139,7 +141,7 @@ def tune(
         np.random.default_rng(seed),
     )
     returns: list[float] = []
-    with closing(Arena(make_env, most_steps=most_steps)) as arena:
+    with closing(Arena(make_env, most_steps=most_steps, advance=advance)) as arena:
         for _ in range(rounds):
             _, reached = entrant.play(arena, range(seed, seed + episodes))
             returns.append(reached)

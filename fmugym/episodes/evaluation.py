@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import compress
 from pathlib import Path
@@ -13,13 +13,15 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.baselines.arena import most_steps_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
-from fmugym.episodes.simulation import Player, Summary, simulate
+from fmugym.episodes.simulation import Player, Policy, Summary, simulate
 from fmugym.errors import plain
 from fmugym.extras import imported
 from fmugym.files import replaced
 from fmugym.series.intervals import confidence
+from fmugym.signals import ordinary
 
 __all__ = [
     "HELD_OUT_SEED",
@@ -108,6 +110,7 @@ def evaluate(
     advance: Advance = no_progress,
     wrap: Wrap = lambda env: env,
     periods: Sequence[tuple[float, int]] = (),
+    leave_out: Callable[[str, Exception], None] | None = None,
 ) -> Iterator[Score]:
     """Let players play the same episodes.
 
@@ -117,10 +120,12 @@ def evaluate(
         seeds: The seeds of the episodes.
         most_steps: The steps after which an episode is stopped.
         scenario: The scenario that the environment plays, for the scores.
-        advance: Is told of each step.
+        advance: Is told of each step, as a part of an episode.
         wrap: Puts wrappers around the environment, such as a recorder.
         periods: Start times and numbers of steps of the episodes, one for each seed, if the task
             draws its start time.
+        leave_out: Is told of a player that cannot play to the end, by name and with the reason; the
+            others play all the same. By default what it raises comes out.
 
     Yields:
         A score for each player, in their order, as soon as it is known.
@@ -129,26 +134,50 @@ def evaluate(
     own: list[tuple[float | None, int]] = [(None, most_steps)] * len(seeds)
     with ExitStack() as stack:
         envs: dict[bool, Any] = {}  # by whether they are in the physical form
-        for name, player in players.items():
+        policies: dict[str, Policy] = {}
+        for name, player in players.items():  # so that no mistake comes up after another has played
             if player.is_physical not in envs:
                 env = stack.enter_context(closing(player.make_env(make_env)))
                 envs[player.is_physical] = stack.enter_context(closing(wrap(env)))
-            played = envs[player.is_physical]
-            policy, begin = player.make_policy(played.unwrapped), perf_counter()
+            with _leaving_out(name, leave_out):
+                policies[name] = player.make_policy(envs[player.is_physical].unwrapped)
+        for name, policy in policies.items():
+            played, begin = envs[players[name].is_physical], perf_counter()
             episodes: list[Summary] = []
-            each = (
-                simulate(played, policy, seed, steps, advance, start)
-                for seed, (start, steps) in zip(seeds, periods or own, strict=True)
-            )
             try:
-                episodes.extend(each)
+                with _leaving_out(name, leave_out):
+                    for seed, (start, steps) in zip(seeds, periods or own, strict=True):
+                        episodes.append(_played(played, policy, seed, steps, advance, start))
             except KeyboardInterrupt:
                 if episodes:
                     yield _score(name, episodes, perf_counter() - begin, scenario, first)
                 raise
+            if len(episodes) < len(seeds):  # it is left out
+                continue
             score = _score(name, episodes, perf_counter() - begin, scenario, first)
             yield score
             first = first or (score.rewards if name != _RANDOM else ())
+
+
+@contextmanager
+def _leaving_out(name: str, leave_out: Callable[[str, Exception], None] | None) -> Iterator[None]:
+    """Tell of an error in a block, if somebody wants to know, instead of raising it."""
+    try:
+        yield
+    except ordinary(Exception) as error:
+        if leave_out is None:
+            raise
+        leave_out(name, error)
+
+
+def _played(
+    env: Any, policy: Policy, seed: int, steps: int, advance: Advance, start: float | None
+) -> Summary:
+    """Play an episode, and tell which part of it each step is."""
+    part = 1 / min(steps, most_steps_of(env.unwrapped) or steps)
+    summary = simulate(env, policy, seed, steps, lambda count: advance(count * part), start)
+    advance(max(0.0, 1 - summary.steps * part))
+    return summary
 
 
 def _score(

@@ -15,6 +15,11 @@ Advance = Callable[..., None]
 """Is told how many steps were done since the last call, and perhaps a text to show beside."""
 
 
+_PARTS: Final = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
+
+_FINE: Final = 1000
+"""So many parts of a bar are told apart where nothing is counted."""
+
 quiet: Final = ContextVar("quiet", default=False)
 """Whether to show results and errors only."""
 
@@ -30,12 +35,12 @@ def _is_watched() -> bool:
 
 @contextmanager
 def progress(total: float | None, what: str, unit: str = "steps") -> Iterator[Advance]:
-    """Show a bar, in a terminal or a notebook, if tqdm is installed (extra ``sb3``).
+    """Show a bar and the time left, in a terminal or a notebook, if tqdm is installed (``sb3``).
 
     Args:
         total: The number of steps; None if it is not known.
         what: A word for what is done.
-        unit: What is counted.
+        unit: What is counted; "" if only parts are shown.
     """
     if quiet.get() or not _is_watched():
         yield no_progress
@@ -45,13 +50,15 @@ def progress(total: float | None, what: str, unit: str = "steps") -> Iterator[Ad
     except ImportError:
         yield no_progress
         return
-    whole = None if total is None else round(total)
-    with tqdm(total=whole, desc=what, unit=f" {unit}", ascii=True, leave=False, delay=1) as bar:
+    scale = 1.0 if unit or not total else _FINE / total
+    whole = None if total is None else round(total * scale)
+    form = {"unit": f" {unit}"} if unit else {"bar_format": _PARTS}
+    with tqdm(total=whole, desc=what, ascii=True, leave=False, delay=1, **form) as bar:
         done = 0.0
 
         def advance(steps: float, text: str = "") -> None:
             nonlocal done
-            done += steps  # which may be parts of one, as those of averages
+            done += steps * scale  # which may be parts of one, as those of averages
             if text:
                 bar.set_postfix_str(text, refresh=False)
             bar.update(round(done) - bar.n)

@@ -34,7 +34,8 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 ``info`` and ``new`` execute nothing of the FMU, the others do. Output is printable text; letters
 that the console lacks are escaped. The exit code is 0; 1 if something cannot be used (the error
 stream says why), ``validate`` finds an error, ``simulate`` meets a reward that is no finite number,
-or ``demo`` has not learned; 2 if the arguments are wrong; 130 after Ctrl-C, which keeps what was
+``demo`` has not learned, or ``evaluate`` or ``simulate`` leave one out; 2 if the arguments are
+wrong; 130 after Ctrl-C, which keeps what was
 written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143 or 129.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
@@ -147,8 +148,16 @@ def _code_of(arguments: argparse.Namespace) -> int:
     except ordinary(FMUGymError, OSError) as error:
         for line in _told(error).splitlines():  # a task may have several mistakes
             note(line, "error")
-        return 1
+        return 1 if (end := _end_before(error)) is None else exit_code(end)
     return 0
+
+
+def _end_before(error: BaseException) -> KeyboardInterrupt | None:
+    """The interruption after which a clean-up has failed."""
+    origin: BaseException | None = error
+    while origin is not None and not isinstance(origin, KeyboardInterrupt):
+        origin = origin.__context__
+    return origin
 
 
 def _told(error: Exception) -> str:

@@ -9,7 +9,6 @@ from typing import Final
 
 from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
-from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.options import (
     Commands,
@@ -26,6 +25,7 @@ from fmugym.tools.options import (
     write_extension,
 )
 from fmugym.tools.targets import maker_of
+from fmugym.tools.watching import watched
 
 __all__ = ["add_tune"]
 
@@ -71,11 +71,10 @@ def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) 
     make_env = partial(
         maker_of(arguments.task, arguments.scenario, arguments.master), physical=True
     )
-    with progress(arguments.rounds, "tune", "rounds") as advance:
+    with watched(arguments.rounds, "tune") as advance:
 
         def noted(best: Tuning) -> None:
             found.append(best)
-            advance(1)
             text = search.text(best.parameters)
             tell(f"round {len(best.returns)}: reward {best.mean_return:.6g} by {text}")
 
@@ -89,6 +88,7 @@ def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) 
             most_steps=arguments.steps,
             seed=arguments.seed,
             watch=noted,
+            advance=advance,
         )
 
 

@@ -15,7 +15,6 @@ from typing import Any, Final
 from fmugym.checks import check_number
 from fmugym.episodes.evaluation import Score, table
 from fmugym.episodes.output_files import title_of
-from fmugym.episodes.progress_bars import Advance, no_progress, progress
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.tools.options import (
@@ -28,6 +27,7 @@ from fmugym.tools.options import (
     tell,
 )
 from fmugym.tools.targets import maker_of, scenarios_of
+from fmugym.tools.watching import watched
 from fmugym.training.agents import FACTS
 from fmugym.training.checkpoints import CHECKPOINT
 from fmugym.training.diary import Diary
@@ -130,7 +130,6 @@ _OF_ALGORITHMS: Final = (
 _OF_SEARCHES: Final = ("minutes", "rounds")
 _OTHERWISE: Final = {"arguments": "KEY=VALUE", "normalize": "--no-normalize"}
 _COUNTS: Final = ("rounds", "steps", "envs", "episodes")
-_BETWEEN_LINES: Final = 10.0
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -177,8 +176,8 @@ def _search(arguments: argparse.Namespace) -> None:
         **counts,
     )
     total = round(searching.seconds) if isfinite(searching.seconds) else None
-    with progress(total, "train", "s") as advance:
-        searching.advance = _lines() if advance is no_progress else advance
+    with watched(total, "train", "s", lambda: monotonic()) as advance:
+        searching.advance, searching.progress = advance, watched
         try:
             facts = searching.run(resume=arguments.resume)
         except KeyboardInterrupt:
@@ -201,19 +200,6 @@ def _tell_faults(parts: Mapping[str, float]) -> None:
         tell(f"episodes that a fault has cut short, which count before the reward: {listing}")
 
 
-def _lines() -> Advance:
-    """Tell the scores in a line every ten seconds."""
-    last = monotonic()
-
-    def show(seconds: float, text: str) -> None:
-        nonlocal last
-        if monotonic() - last > _BETWEEN_LINES:
-            last = monotonic()
-            tell(text)
-
-    return show
-
-
 def _learn(arguments: argparse.Namespace) -> None:
     settings, begin_tracker = _settings_of(arguments), None
     if arguments.track is not None:
@@ -221,7 +207,7 @@ def _learn(arguments: argparse.Namespace) -> None:
         begin_tracker = tracker_for(arguments.track, facts, settings.folder)
     if arguments.tune is not None:
         settings = _tuned(settings, arguments)
-    with progress(settings.steps, "train") as advance:
+    with watched(settings.steps, "train", "steps") as advance:
         watch = Watch(tell, advance, begin_tracker=begin_tracker)
         try:
             scores = train(settings, resume=arguments.resume, watch=watch)
@@ -285,7 +271,7 @@ def _tuned(settings: TrainingSettings, arguments: argparse.Namespace) -> Trainin
         raise ConfigError("--tune is for a new training, which --resume is not")
     arguments.tune_steps = arguments.tune_steps or max(1, settings.steps // 10)
     check_numbers(arguments, "tune", "tune_steps")
-    with progress(arguments.tune, "tune", "trials") as advance:
+    with watched(arguments.tune, "tune", "trials") as advance:
 
         def noted(line: str) -> None:
             advance(1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,10 @@ from fmugym.baselines.arena import most_steps_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
-from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
-from fmugym.errors import ConfigError, plain
+from fmugym.errors import ConfigError, plain, reason
 from fmugym.logs import PlantLog
+from fmugym.signals import ordinary
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
 from fmugym.tools.options import (
     Commands,
@@ -32,11 +32,13 @@ from fmugym.tools.options import (
     say_json,
     say_result,
     shown_in_any_case,
+    tell,
 )
 from fmugym.tools.plants import add_of_plants, follow_plant, task_of
 from fmugym.tools.shadows import evaluate_log
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
+from fmugym.tools.watching import watched
 
 __all__ = ["add_bench", "add_evaluate", "add_simulate"]
 
@@ -89,13 +91,19 @@ def _simulate(arguments: argparse.Namespace) -> int:
             only = {"episodes": next(iter(told.values()))} if len(told) == 1 else {}
             say_json({"task": arguments.task, "output": arguments.output, "runs": told, **only})
 
-    for player in players.values() if len(players) > 1 else ():
-        with closing(player.make_env(_maker(arguments))) as env:
+    left_out = LeftOut(players)
+    for name, player in players.items() if len(players) > 1 else ():
+        with left_out.noting(name), closing(player.make_env(_maker(arguments))) as env:
             player.make_policy(env)  # so that no mistake comes up after another has played
+    left_out.require_some()
     with shown_in_any_case(show), recording.finished(arguments.seed):
         for name, player in players.items():
-            _play(arguments, recording, name, player, runs)
-    return int(any(one.has_no_reward for found in runs.values() for one in found))
+            if name not in left_out.errors:
+                with left_out.noting(name):
+                    _play(arguments, recording, name, player, runs)
+        left_out.require_some()
+    is_nothing = any(one.has_no_reward for found in runs.values() for one in found)
+    return left_out.code or int(is_nothing)
 
 
 def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
@@ -113,7 +121,7 @@ def _play(
     label = f"{name}: " if len(runs) > 1 else ""
     with (
         closing(player.make_env(_maker(arguments))) as env,
-        progress(_steps_of(env, arguments), name) as advance,
+        watched(_steps_of(env, arguments), name, "steps") as advance,
     ):
         policy = player.make_policy(env)
         played: Any = env
@@ -155,7 +163,7 @@ def add_evaluate(commands: Commands) -> None:
     add_json(command)
 
 
-def _evaluate(arguments: argparse.Namespace) -> None:
+def _evaluate(arguments: argparse.Namespace) -> int:
     check_numbers(arguments, "episodes", "steps")
     if arguments.plot is not None:
         require_picture(arguments.plot)
@@ -164,22 +172,81 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     players = players_of(arguments, random=arguments.log is None)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     scores: list[Score] = []
+    left_out = LeftOut(players)
+
+    def leave_out(name: str, error: Exception) -> None:
+        left_out.note(name, error)
+        if not scores:  # nobody has played
+            left_out.require_some()
+
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         if arguments.log is not None:
             task, log = task_of(arguments), PlantLog.read(arguments.log)
-            with progress(None, "evaluate") as advance:
-                scores.extend(evaluate_log(task, log, players, advance))
-            return
-        for scenario in _scenarios(arguments):
-            make_env = maker_of(arguments.task, scenario, arguments.master)
-            label = "evaluate" if scenario is None else scenario
-            with progress(None, label) as advance:
-                played = evaluate(make_env, players, seeds, arguments.steps, scenario, advance)
-                scores.extend(played)  # one by one, so that an interruption keeps them
+            with watched(1.0, "evaluate") as advance:
+                scores.extend(evaluate_log(task, log, players, advance, leave_out))
+        else:
+            scenarios = _scenarios(arguments)
+            total = len(scenarios) * len(players) * arguments.episodes
+            with watched(total, "evaluate") as advance:
+                for scenario in scenarios:
+                    make_env = maker_of(arguments.task, scenario, arguments.master)
+                    more = scenario, advance
+                    played = evaluate(
+                        make_env, players, seeds, arguments.steps, *more, leave_out=leave_out
+                    )
+                    scores.extend(played)  # one by one, so that an interruption keeps them
+    left_out.require_some()
+    return left_out.code
+
+
+class LeftOut:
+    """Those who cannot play to the end, and are left out. The others play all the same.
+
+    Args:
+        players: All who shall play, by name.
+
+    Attributes:
+        errors: Why, by the names of those who are left out.
+    """
+
+    def __init__(self, players: Iterable[str]) -> None:
+        self._names = [*players]
+        self.errors: dict[str, Exception] = {}
+
+    def note(self, name: str, error: Exception) -> None:
+        """Leave one out, and say why, if others are there."""
+        self.errors[name] = error
+        if self._asked != [name]:
+            tell(f"left out: {name}: {reason(error)}", is_needed=True)
+
+    @contextmanager
+    def noting(self, name: str) -> Iterator[None]:
+        """Leave one out who fails in a block."""
+        try:
+            yield
+        except ordinary(Exception) as error:
+            self.note(name, error)
+
+    @property
+    def _asked(self) -> list[str]:
+        """Those who were asked for; random actions always play."""
+        return [name for name in self._names if name != "random"] or self._names
+
+    def require_some(self) -> None:
+        """Raise the first error if none is left of those who were asked for."""
+        if all(name in self.errors for name in self._asked):
+            raise self.errors[self._asked[0]]
+
+    @property
+    def code(self) -> int:
+        """The exit code."""
+        return 1 if self.errors else 0
 
 
 def _show_scores(scores: list[Score], arguments: argparse.Namespace) -> None:
-    if arguments.plot is not None and scores:
+    if not scores:
+        return
+    if arguments.plot is not None:
         plot_scores(scores, arguments.plot, title_of(arguments.task))
     say_result(arguments, {"scores": [one.as_dict() for one in scores]}, table(scores))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -37,7 +37,11 @@ class _Costs(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def evaluate_log(
-    task: Task, log: PlantLog, players: Mapping[str, Player], advance: Advance
+    task: Task,
+    log: PlantLog,
+    players: Mapping[str, Player],
+    advance: Advance,
+    leave_out: Callable[[str, Exception], None] | None = None,
 ) -> Iterator[Score]:
     """Compare what a plant has reached with what others reach on the FMU in the same periods.
 
@@ -45,7 +49,8 @@ def evaluate_log(
         task: The task.
         log: The record of a shadow, whose times are seconds of the year.
         players: Who acts on the FMU.
-        advance: Is told of each step.
+        advance: Is told of each step on the FMU, as a part of all.
+        leave_out: See ``evaluate``.
 
     Yields:
         The score of the plant, as it was measured; those of the FMU with the actions that acted and
@@ -72,8 +77,17 @@ def evaluate_log(
     periods = [(one.drawn["start_time"], len(one)) for one in recordings]
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + len(periods))
     most = max(map(len, recordings))
+    players = {**acted, **players}
+    count = len(periods) * len(players)
     yield from evaluate(
-        partial(load, task), {**acted, **players}, seeds, most, None, advance, periods=periods
+        partial(load, task),
+        players,
+        seeds,
+        most,
+        None,
+        lambda part: advance(part / count),
+        periods=periods,
+        leave_out=leave_out,
     )
 
 

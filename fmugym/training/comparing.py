@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.arena import Arena, Outcome
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.search.policy import Agent
 from fmugym.series.intervals import confidence
+from fmugym.signals import ordinary
 
 __all__ = ["judge", "verdict"]
 
 
 def judge(
-    agents: Mapping[str, Agent], arenas: Mapping[str, Arena], episodes: int
+    agents: Mapping[str, Agent],
+    arenas: Mapping[str, Arena],
+    episodes: int,
+    leave_out: Callable[[str, Exception], None],
+    advance: Callable[[str, float], None] = lambda name, part: None,
 ) -> dict[str, Any]:
     """Let agents play the same episodes.
 
@@ -25,6 +30,9 @@ def judge(
         agents: By name.
         arenas: Those of the scenarios, by name; they are closed.
         episodes: How many episodes of each scenario.
+        leave_out: Is told of an agent that cannot play to the end, or of a scenario that cannot be
+            opened, by name and with the reason. The others play all the same.
+        advance: Is told which part of all its episodes an agent has played since the last call.
 
     Returns:
         By the names of the agents, in types that JSON has: ``total_reward``, the mean of an
@@ -32,17 +40,35 @@ def judge(
         ``mean_costs`` by name, with the part of ``failed episodes``, which a fault has cut short.
     """
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes)
-    played = []
-    for arena in arenas.values():
+    played: dict[str, list[Outcome]] = {name: [] for name in agents}
+    opened = []
+    for scenario, arena in arenas.items():
         with closing(arena):
-            played.append([agent.play(arena, seeds) for agent in agents.values()])
+            try:
+                arena.open(len(seeds))
+            except ordinary(Exception) as error:
+                leave_out(f"scenario {scenario}" if len(arenas) > 1 else scenario, error)
+                continue
+            opened.append(scenario)
+            for name in list(played):
+                arena.advance = lambda part, name=name: advance(name, part / len(arenas))  # type: ignore[misc]
+                try:
+                    played[name].append(agents[name].play(arena, seeds))
+                except ordinary(Exception) as error:
+                    leave_out(name, error)
+                    del played[name]
+                    arena.close()  # its episodes are in the middle of something
+    return _told(played if opened else {}, opened)
+
+
+def _told(played: Mapping[str, Sequence[Outcome]], scenarios: Sequence[str]) -> dict[str, Any]:
     test = {}
-    for name, outcomes in zip(agents, zip(*played, strict=True), strict=True):
+    for name, outcomes in played.items():
         costs = np.mean([one.costs for one in outcomes], axis=(0, 1, 2)).tolist()
         rewards = (one.returns[0].tolist() for one in outcomes)
         test[name] = {
             "total_reward": sum(float(one.returns.mean()) for one in outcomes),
-            "rewards": dict(zip(arenas, rewards, strict=True)),
+            "rewards": dict(zip(scenarios, rewards, strict=True)),
             "mean_costs": dict(zip((*outcomes[0].limits, "failed episodes"), costs, strict=True)),
         }
     return test

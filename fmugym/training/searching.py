@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -18,13 +18,13 @@ from fmugym.baselines.entrants import NO_MERIT
 from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
-from fmugym.errors import ConfigError, reading, shown
+from fmugym.errors import ConfigError, reading, reason, shown
 from fmugym.files import replaced_together
 from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
 from fmugym.search.search_file import bytes_of, plain_of, search_in
-from fmugym.signals import Ignoring
+from fmugym.signals import Ignoring, ordinary
 from fmugym.training.agents import FACTS
 from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
@@ -73,6 +73,8 @@ class Searching:
         episodes: Of the test, in each scenario; None for the default.
         tell: Gets lines of text.
         advance: Is told after each round of the seconds since the last one, and of the scores.
+        progress: Shows how far a part of the work is, of which it gets the seconds that it takes
+            about, and a word.
     """
 
     make_env: Callable[[], FMUEnv]
@@ -86,6 +88,9 @@ class Searching:
     episodes: int | None = None
     tell: Callable[[str], None] = lambda line: None
     advance: Advance = no_progress
+    progress: Callable[[float, str], AbstractContextManager[Advance]] = lambda seconds, what: (
+        nullcontext(no_progress)
+    )
 
     @property
     def seconds(self) -> float:
@@ -109,6 +114,7 @@ class Searching:
             FileExistsError: If the folder exists, unless a search is resumed.
         """
         self._begin = monotonic()
+        self._seconds_of: dict[str, float] = {}
         self._found = self._resumed() if resume else self._begun()
         self._probe, self._before = self._found.probe, self._found.steps
         self._tell_the_plan()
@@ -292,8 +298,29 @@ class Searching:
         others = (one.best for one in found.controllers)
         for other in filter(None, [baseline, *others, *planners]):
             agents.setdefault(other.name, other)
-        test = judge(agents, arenas, count)
-        return self._save(winner, test=test, verdict=verdict(test, probe.limits))
+        test = self._test(agents, arenas, count)
+        text = f"no verdict: {winner.name} could not play the test"
+        if winner.name in test:
+            text = verdict(test, probe.limits)
+        return self._save(winner, test=test, verdict=text)
+
+    def _test(
+        self, agents: Mapping[str, Agent], arenas: Mapping[str, Arena], count: int
+    ) -> dict[str, Any]:
+        """Let agents play, and show how far they are; nothing that one does ends the test."""
+        usual = self._probe.seconds * self._probe.usual_steps * count * len(arenas)
+        seconds = {name: self._seconds_of.get(name, usual) for name in agents}
+        with self.progress(sum(seconds.values()), "test") as advance:
+            return judge(
+                agents,
+                arenas,
+                count,
+                self._leave_out,
+                lambda name, part: advance(part * seconds[name]),
+            )
+
+    def _leave_out(self, name: str, error: Exception) -> None:
+        self.tell(f"left out: {name}: {reason(error)}")
 
     def _planners(self, baseline: str | None, episodes: int) -> Iterator[Agent]:
         """The controllers that plan ahead and whose test takes no longer than the search.
@@ -305,15 +332,21 @@ class Searching:
             episodes: Those of the test. Its first steps tell how long a step takes.
         """
         for name, text in self._probe.task.get("controllers", {}).items():
-            if plans_ahead(text):
+            if not plans_ahead(text):
+                continue
+            try:
                 agent = Agent(name, warmed(text, baseline))
                 with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
                     agent.play(arena, range(1))
-                minutes = arena.seconds / arena.steps * self._probe.most_steps * episodes / 60.0
-                if minutes <= (self.minutes or _MINUTES):
-                    yield agent
-                else:
-                    self.tell(
-                        f"left out: {name}, whose test would take about {minutes:.0f} min; "
-                        "'fmugym evaluate' compares it with the agent"
-                    )
+            except ordinary(Exception) as error:
+                self._leave_out(name, error)
+                continue
+            seconds = arena.seconds / arena.steps * self._probe.most_steps * episodes
+            if seconds <= 60.0 * (self.minutes or _MINUTES):
+                self._seconds_of[name] = seconds
+                yield agent
+            else:
+                self.tell(
+                    f"left out: {name}, whose test would take about {seconds / 60.0:.0f} min; "
+                    "'fmugym evaluate' compares it with the agent"
+                )

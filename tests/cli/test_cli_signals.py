@@ -1,5 +1,6 @@
 """Signals that end the command line: clean-ups are made, and what was written stays."""
 
+import itertools
 import json
 import os
 import signal
@@ -14,7 +15,11 @@ from process_tools import faulty_fmu, start_values
 
 import fmugym
 from fmugym import __main__ as program
+from fmugym.baselines.arena import Arena
+from fmugym.search.probe import Probe
+from fmugym.search.search import Search
 from fmugym.tools import ending
+from fmugym.training import outcome, searching
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -105,6 +110,80 @@ class TestEnd:
         time.sleep(0.3)
         assert process.poll() is None
         self.ended(process, signal.SIGTERM, temp_root)
+
+
+PENDULUM = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "0.5s",
+    "variables": {"tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["q", "q_dot"]},
+    "reward": "-abs(q)",
+}
+MOMENTS = {
+    "a look at the task": (Probe, "of", 1),
+    "the first round": (Search, "advance", 1),
+    "a later round": (Search, "advance", 30),
+    "writing an agent": (searching, "bytes_of", 1),
+    "writing a better one": (searching, "bytes_of", 3),
+    "the test": (searching, "judge", 1),
+    "the picture": (outcome, "draw_curve", 1),
+}
+
+
+@pytest.fixture(params=[signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def number(request, monkeypatch):
+    """A signal that ends commands."""
+    monkeypatch.setattr(ending, "_begun", threading.Event())
+    before = signal.signal(request.param, ending._raise)
+    yield request.param
+    signal.signal(request.param, before)
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_of_train(moment, number, tmp_path, cli, monkeypatch):
+    """The exit status tells the signal; the folder has the best agent until then, or is gone."""
+    owner, name, which = MOMENTS[moment]
+    function, count = getattr(owner, name), itertools.count(1)
+
+    def signalled(*arguments, **options):
+        if next(count) == which:
+            os.kill(os.getpid(), number)
+        return function(*arguments, **options)
+
+    fmugym.Task.from_dict(PENDULUM).write(tmp_path / "task.toml")
+    folder = tmp_path / "agent"
+    monkeypatch.setattr(owner, name, signalled)
+    command = "train", tmp_path / "task.toml", "--output", folder, "--episodes", "1"
+    code, _, err = cli(*command, "--rounds", "40")
+    assert next(count) > which
+    assert code == 128 + number, err
+    assert not [line for line in err.splitlines() if "rror" in line]
+    if folder.exists():
+        kept = {path.name for path in folder.iterdir()}
+        assert {"policy.json", "agent.json", "search.npz"} <= kept
+        assert not [name for name in kept if ".part" in name]
+        assert cli("simulate", tmp_path / "task.toml", "--agent", folder)[0] == 0
+    else:
+        assert moment in ("a look at the task", "the first round", "writing an agent")
+
+
+def test_an_error_in_a_clean_up_does_not_hide_the_signal(number, tmp_path, cli, monkeypatch):
+    """Errors of the system, too, which happen while the signal ends the command."""
+    fmugym.Task.from_dict(PENDULUM).write(tmp_path / "task.toml")
+
+    def fails(*arguments):
+        raise OSError(39, "Directory not empty")
+
+    def signalled(search, arena):
+        monkeypatch.setattr(Arena, "close", fails)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(Search, "advance", signalled)
+    command = "train", tmp_path / "task.toml", "--output", tmp_path / "agent"
+    code, _, err = cli(*command, "--rounds", "40")
+    assert code == 128 + number, err
+    assert "Directory not empty" in err
 
 
 def test_while_modules_are_loaded(monkeypatch):
