@@ -80,6 +80,9 @@ def statistics() -> dict[str, int]:
 def initializations() -> int:
     """How many initializations the pools of this process have begun."""
 
+def undisturbed(function: Callable[..., Any], /, *arguments: Any) -> Any:
+    """Call a function; handlers of signals that arrive meanwhile run afterwards."""
+
 def text_with(number: float, /) -> str | None:
     """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
 

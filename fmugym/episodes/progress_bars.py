@@ -54,13 +54,14 @@ def progress(total: float | None, what: str, unit: str = "steps") -> Iterator[Ad
     whole = None if total is None else round(total * scale)
     form = {"unit": f" {unit}"} if unit else {"bar_format": _PARTS}
     with tqdm(total=whole, desc=what, ascii=True, leave=False, delay=1, **form) as bar:
-        done = 0.0
+        done, shown = 0.0, 0
 
         def advance(steps: float, text: str = "") -> None:
-            nonlocal done
+            nonlocal done, shown
             done += steps * scale  # which may be parts of one, as those of averages
             if text:
                 bar.set_postfix_str(text, refresh=False)
-            bar.update(round(done) - bar.n)
+            before, shown = shown, round(done)
+            bar.update(shown - before)
 
         yield advance

@@ -28,4 +28,7 @@ bool handlers_release(Held *held);
 /* The same where nothing can be raised: the handlers run later. */
 void handlers_postpone(Held *held);
 
+/* A function of the module */
+PyObject *py_undisturbed(PyObject *module, PyObject *args);
+
 #endif

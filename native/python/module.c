@@ -72,6 +72,7 @@ static PyMethodDef functions[] = {
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"text_with", py_text_with, METH_O, NULL},
+    {"undisturbed", py_undisturbed, METH_VARARGS, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},
     {"end_with", py_end_with, METH_O, NULL},
     {"stop_tracing", py_stop_tracing, METH_VARARGS, NULL},

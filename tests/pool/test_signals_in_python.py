@@ -125,6 +125,20 @@ def test_a_rollout(make, raised):
         assert short.observations[:, -1, 0] == pytest.approx([0.2] * 3, rel=1e-6)
 
 
+def test_the_classes_of_fmpy(fmu, make, raised, monkeypatch):
+    """They are in the caller's process, too."""
+    with make(STEP)(backend="fmpy") as env:
+        env.reset(seed=0)
+        assert len(play(env, 3)) == 3
+        with pytest.raises(raised[1]):
+            play(env, 1)
+    with make(INITIALIZATION)(backend="fmpy") as env, pytest.raises(raised[1]):
+        env.reset(seed=0)
+    monkeypatch.setenv("FMUGYM_TEST_SIGNAL", str(int(raised[0])))
+    with pytest.raises(raised[1]):
+        make(0)(backend="fmpy")
+
+
 def test_what_an_mpc_plans_on(make, raised):
     """Its copies get the signal while a plan is played; afterwards they are as good as new."""
     with make(STEP)() as env:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import logging
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, ParamSpec, TypeVar
 
 from fmpy.fmi1 import FMICallException, FMU1Slave
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
@@ -20,6 +21,7 @@ from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status, failed_call, sane
 from fmugym.pool.backend.messages import Messages, fmi1_callbacks, fmi2_callbacks
 from fmugym.pool.backend.rig import FaultError
+from fmugym.pool.extension import has_native_pool
 from fmugym.pool.spec import START_TIME, PoolSpec
 from fmugym.signals import ordinary
 
@@ -35,6 +37,25 @@ _CONVERSIONS: Final[dict[str, Callable[[Any], Any]]] = {
     "string": str,
 }
 _loading: Final = threading.Lock()
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _undisturbed(method: Callable[P, R]) -> Callable[P, R]:
+    """Let signals wait while an FMU works whose code is Python, which would get what they raise."""
+
+    @functools.wraps(method)
+    def call(*arguments: P.args, **named: P.kwargs) -> R:
+        me: Any = arguments[0]
+        if not me.calls_python:
+            return method(*arguments, **named)
+        from fmugym import _native
+
+        result: R = _native.undisturbed(method, *arguments)
+        return result
+
+    return call
 
 
 class FMPyInstance:
@@ -54,6 +75,7 @@ class FMPyInstance:
 
     def __init__(self, fmu: FMU, spec: PoolSpec, log: logging.Logger, library: Path) -> None:
         self._fmu, self._spec, self._library = fmu, spec, library
+        self.calls_python = has_native_pool() and fmu.calls_python()
         self._version = fmu.description.fmi_major_version
         self._messages = Messages(fmu.description.model_identifier, log)
         self._slave: Any = None
@@ -63,6 +85,7 @@ class FMPyInstance:
         self._instantiate()
         self.stop()
 
+    @_undisturbed
     def reset(self, start_values: Mapping[str, Any]) -> list[Any]:
         """See ``Backend.reset``; the name of ``START_TIME`` stands for the start time."""
         self.stop()
@@ -74,6 +97,7 @@ class FMPyInstance:
         self._is_initialized = True
         return list(self._spec.start_outputs) if self._spec.blind_start else self._outputs()
 
+    @_undisturbed
     def step(self, inputs: Mapping[str, float]) -> tuple[list[Any], int]:
         """See ``Backend.step``."""
         if self._slave is None:
@@ -86,6 +110,7 @@ class FMPyInstance:
                 return outputs, Status.TERMINATED
         return self._outputs(), Status.OK
 
+    @_undisturbed
     def stop(self) -> None:
         """Free the instance and its library; see ``Backend.stop``."""
         slave, self._slave = self._slave, None
@@ -113,6 +138,7 @@ class FMPyInstance:
 
     # The beginning of an episode.
 
+    @_undisturbed
     def _instantiate(self) -> None:
         self._status, self._is_initialized = Status.OK, False
         slave = self._load()
