@@ -11,6 +11,7 @@ actions that write the logged inputs.
 
 from __future__ import annotations
 
+import datetime
 import math
 import os
 import re
@@ -26,10 +27,15 @@ from gymnasium import spaces
 
 from fmugym.archive.units import Conversion, conversion_of
 from fmugym.archive.variable import Variable
-from fmugym.checks import Spellings, check_number, require_regular
+from fmugym.checks import Spellings, check_number
 from fmugym.declared import Task
+from fmugym.declared.data_files import read_tables
+from fmugym.declared.data_rows import usual_distance
+from fmugym.declared.data_tables import Column, Table
+from fmugym.declared.dates import CURE, HOUR, YEAR, zone_of
 from fmugym.declared.entries import Entry
-from fmugym.declared.series import is_number, read_csv, read_data
+from fmugym.declared.series import read_data
+from fmugym.declared.standard_time import standard_time
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reading, shown, unknown_name
@@ -53,8 +59,6 @@ _HEADING: Final = re.compile(r"\s*(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]+)\])?\s*
 _INDEXED: Final = re.compile(r"\d+(,\s*\d+)*$")
 _SAME_TIME: Final = 1e-9
 """Times that differ by less, in seconds, are the same."""
-
-_YEAR: Final = 365 * 86400.0
 
 _PROPOSED: Final = "proposed."
 """What the names of columns of proposals begin with."""
@@ -85,45 +89,52 @@ class PlantLog:
     texts: Mapping[str, npt.NDArray[np.object_]] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str], *, inputs_before: bool | None = None) -> PlantLog:
-        """Read a CSV file.
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        inputs_before: bool | None = None,
+        timezone: str | None = None,
+        standard: int | None = None,
+    ) -> PlantLog:
+        """Read a CSV or Parquet file.
 
         The first row names the columns, with or without a unit: ``T [degC]``. There must be a
-        column ``time``, in seconds. A column ``episode`` tells episodes apart; without it, an
-        episode begins where the time goes back. An empty cell was not measured. Files of
-        ``RecordSeries`` are such logs.
+        column ``time``, in seconds or with dates. A column ``episode`` tells episodes apart;
+        without it, an episode begins where the time goes back, or after a gap in regular rows. An
+        empty cell was not measured. Files of ``RecordSeries`` are such logs.
 
         Args:
             path: The file.
             inputs_before: As the attribute. By default it is True for files with a column
                 ``step``, as ``RecordSeries`` writes them.
+            timezone: The zone of dates that have no offset from UTC, such as ``"Europe/Berlin"``.
+            standard: The offset of the task's standard time in seconds east of UTC, on which times
+                are; by default the smallest offset of the dates.
 
         Raises:
             ConfigError: If the file cannot be read, a cell that is needed is no number, or times do
                 not rise.
         """
-        with reading(f"{shown(str(path))} cannot be read"):
-            require_regular(Path(path))
-            columns = read_csv(Path(path), Path(path).read_bytes())
-        units: dict[str, str] = {}
-        values: dict[str, FloatArray] = {}
-        texts: dict[str, npt.NDArray[np.object_]] = {}
-        for heading, cells in columns.items():
-            name, unit = _heading(heading)
-            if not name:
-                continue
-            if unit == TEXT or not is_number(next(filter(None, cells), "")):
-                texts[name] = np.array(cells, object)
-                continue
-            values[name] = np.array([_number(path, heading, cell) for cell in cells])
-            if unit:
-                units[name] = unit
-        if "time" not in values:
-            raise ConfigError(f"{shown(str(path))} has no column 'time' of numbers")
-        times = values.pop("time")
-        numbers = values.pop("episode", np.cumsum(np.diff(times, prepend=times[:1]) < 0.0))
-        _require_rising(path, times, numbers)
+        zone = None if timezone is None else zone_of("timezone", timezone)
+        columns, units = _columns(path)
+        time = Table([*columns.values()]).find_time()
+        if time is None or units.pop(time.name, "s") != "s":
+            raise ConfigError(f"{shown(str(path))} has no column 'time' of seconds or dates")
+        del columns[time.name]
+        texts = {
+            name: np.array([*column.cells], object)
+            for name, column in columns.items()
+            if units.get(name) == TEXT or not column.is_numeric
+        }
+        values = {name: one.numbers for name, one in columns.items() if name not in texts}
+        times, is_known = _times(time, zone, standard)
+        numbers = values.pop("episode", None)
+        numbers = _episodes(times, is_known) if numbers is None else numbers[is_known]
+        _require_rising(time, np.flatnonzero(is_known), times, numbers)
         before = "step" in values if inputs_before is None else inputs_before
+        values, texts = ({n: one[is_known] for n, one in a.items()} for a in (values, texts))
+        units = {name: unit for name, unit in units.items() if name in values}
         return cls(times, values, units, numbers.astype(np.float64), before, texts)
 
     @property
@@ -169,21 +180,63 @@ def _heading(text: str) -> tuple[str, str | None]:
     return match["name"], unit
 
 
-def _number(path: Any, heading: str, cell: str) -> float:
-    """The number in a cell; NaN for what was not measured."""
-    try:
-        return float(cell or "nan")
-    except ValueError:
-        text = f"{shown(str(path))}: expected a number in column {shown(heading)}, got {cell!r}"
-        raise ConfigError(text) from None
+def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, Column], dict[str, str]]:
+    """The columns of a log by name, and their units."""
+    with reading(f"{shown(str(path))} cannot be read"):
+        (table,) = read_tables(Path(path)).values()
+    columns: dict[str, Column] = {}
+    units: dict[str, str] = {}
+    for column in table.columns:
+        name, unit = _heading(column.name)
+        if name in columns:
+            raise ConfigError(f"{shown(str(path))} has two columns {shown(name)}")
+        if name or not column.is_numeric:
+            columns[name] = replace(column, name=name)
+        if unit:
+            units[name] = unit
+    return columns, units
 
 
-def _require_rising(path: Any, times: FloatArray, episodes: FloatArray) -> None:
-    wrong = (np.diff(times) <= 0.0) & (np.diff(episodes) == 0)
-    if wrong.any() or not np.isfinite(times).all():
-        row = int(np.flatnonzero(wrong)[0]) + 3 if wrong.any() else 2
+def _times(
+    time: Column, zone: datetime.tzinfo | None, standard: int | None
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """The times in seconds, without those of 29 February, and which rows they are of."""
+    if time.is_numeric:
+        return time.numbers, np.ones(len(time.rows), np.bool_)
+    dates = time.dates_in(zone)
+    seconds = dates.at(dates.smallest_offset if standard is None else standard).seconds()
+    falls = np.diff(dates.walls)
+    back = np.flatnonzero((falls <= 0) & (falls >= -HOUR * 1e6))
+    if dates.offsets is None and len(back):
+        row = int(back[0])
         raise ConfigError(
-            f"{shown(str(path))}, row {row}: the time must rise within an episode, and be finite"
+            f"the times must rise, but in {time.table} {time.when(row + 1)} is not above "
+            f"{time.when(row)}. {CURE}"
+        )
+    is_known = ~np.isnan(seconds)
+    return seconds[is_known], is_known
+
+
+def _episodes(times: FloatArray, is_known: npt.NDArray[np.bool_]) -> FloatArray:
+    """Numbers of the episodes, which end at gaps, and where the time goes back."""
+    usual, distances = usual_distance(times), np.diff(times, prepend=times[:1])
+    is_gap = distances > (math.inf if usual is None else 2 * usual * (1 + 1e-6))
+    left_out = np.diff(np.cumsum(~is_known)[is_known], prepend=0) > 0
+    return np.cumsum((distances < 0.0) | is_gap | left_out).astype(np.float64)
+
+
+def _require_rising(
+    time: Column, rows: npt.NDArray[Any], times: FloatArray, episodes: FloatArray
+) -> None:
+    wrong = (~(np.diff(times) > 0.0)) & (np.diff(episodes) == 0)
+    if not np.isfinite(times).all():
+        row = int(rows[~np.isfinite(times)][0])
+        raise ConfigError(f"{time.told(row)}: the time must be finite, got {time.cells[row]!r}")
+    if wrong.any():
+        before, after = rows[np.flatnonzero(wrong)[0] + np.arange(2)]
+        raise ConfigError(
+            f"the time must rise within an episode, but in {time.table} {time.when(after)} is not "
+            f"above {time.when(before)}"
         )
 
 
@@ -319,26 +372,28 @@ def on_time_of_year(task: Task, start_time: Any) -> Task:
 
 def as_logged(task: Task, log: PlantLog) -> Task:
     """Return the task on the time of a log of seconds of the year, and with the data in it."""
-    task = on_time_of_year(task, Uniform(0.0, _YEAR))
-    entries = task.root.child("data").items().items()
-    data = {n: _as_logged(entry, log, n) for n, entry in entries if n in log.columns}
+    task = on_time_of_year(task, Uniform(0.0, YEAR))
+    root = task.root
+    entries, standard = root.child("data").items().items(), standard_time(root).offset
+    data = {n: _as_logged(entry, log, n, standard) for n, entry in entries if n in log.columns}
     own = task.document.get("data", {})
     return replace(task, document={**task.document, "data": {**own, **data}}) if data else task
 
 
-def _as_logged(entry: Entry, log: PlantLog, name: str) -> dict[str, Any]:
+def _as_logged(entry: Entry, log: PlantLog, name: str, standard: int | None) -> dict[str, Any]:
     """Data with the values of a log while there are some, and their own at other times."""
-    series, known = read_data(entry), ~np.isnan(log.columns[name])
+    series, known = read_data(entry, standard), ~np.isnan(log.columns[name])
     times, values = log.times[known], log.columns[name][known]
-    if series.period == _YEAR and len(times):
+    if series.period == YEAR and len(times):
         own = series.start + series.times
-        others = (own - times[0]) % _YEAR > np.ptp(times)
+        others = (own - times[0]) % YEAR > np.ptp(times)
         times, values = np.append(times, own[others]), np.append(values, series.values[others])
-    times, first = np.unique(times % _YEAR, return_index=True)
+    times, first = np.unique(times % YEAR, return_index=True)
     values = values[first]
-    left_out = "file", "column", "table", "time", "step"
+    left_out = "file", "column", "table", "time", "step", "timezone"
     kept = {key: value for key, value in entry.value.items() if key not in left_out}
-    found = {"values": values.tolist(), "times": times.tolist(), "period": _YEAR}
+    found: dict[str, Any] = {"values": values.tolist(), "times": times.tolist(), "period": YEAR}
+    found["gaps"] = "interpolate"  # between its own rows and those of the log
     return dict(zip(("min", "max"), series.limits, strict=True)) | kept | found
 
 

@@ -217,3 +217,71 @@ def test_the_record_of_a_shadow_at_the_end_of_a_year_has_its_own_data():
     assert [at(found, moment * day) for moment in (364.6, 365.0, 0.1)] == [9.0] * 3
     for moment in (0.6, 100.0, 364.4):
         assert at(found, moment * day) == at(own, moment * day)
+
+
+class TestTables:
+    """Logs are read as data are: dates with zones, strict numbers, Parquet files."""
+
+    def test_dates_with_offsets_are_on_standard_time(self, tmp_path):
+        rows = [
+            "time,x",
+            "2023-06-30T23:00:00Z,1",
+            "2023-07-01T03:00:00+02:00,2",
+            "2023-07-01T02:00Z,3",
+        ]
+        july = 181 * 86400.0
+        log = log_of(tmp_path, "\n".join(rows), standard=3600)
+        assert log.times.tolist() == [july, july + 7200, july + 10800]
+        assert log_of(tmp_path, "\n".join(rows)).times[0] == july - 3600
+
+    def test_dates_of_a_zone(self, tmp_path):
+        rows = ["time,x", *(f"2023-10-29 0{hour}:00,1" for hour in (1, 2, 2, 3))]
+        with pytest.raises(ConfigError, match=r"row 4 \(2023-10-29 02:00\).*timezone"):
+            log_of(tmp_path, "\n".join(rows))
+        log = log_of(tmp_path, "\n".join(rows), timezone="Europe/Berlin")
+        assert np.diff(log.times).tolist() == [3600] * 3
+        with pytest.raises(ConfigError, match="'Europe/Berlin'"):
+            log_of(tmp_path, "\n".join(rows), timezone="Europe/Berln")
+
+    def test_an_episode_ends_before_29_february(self, tmp_path):
+        rows = ["time,x", *(f"2024-0{day},{day[-1]}" for day in ("2-28", "2-29", "3-01", "3-02"))]
+        log = log_of(tmp_path, "\n".join(rows))
+        assert [part.columns["x"].tolist() for part in log.parts()] == [[8], [1, 2]]
+        assert np.diff(log.times).tolist() == [86400] * 2
+
+    def test_an_episode_ends_at_a_gap_in_regular_rows(self, tmp_path):
+        times = [*range(20), *range(22, 40), 41, *range(300, 320)]
+        rows = ["time,x,x_dot,f", *(f"{0.02 * k:g},{k},0,1" for k in times)]
+        log = log_of(tmp_path, "\n".join(rows))
+        lengths = [len(part.times) for part in log.parts()]
+        assert lengths == [20, 19, 20]
+        assert [len(one) for one in play_log(log, Cart)] == [19, 19, 19]
+
+    def test_numbers_are_those_of_data(self, tmp_path):
+        for cell, heading in (("1_000", "x"), ("\u0661", "x"), ("0x1", "x")):
+            with pytest.raises(ConfigError, match=rf"log\.csv, row 3, column '{heading}'"):
+                log_of(tmp_path, f"time,{heading}\n0,1\n1,{cell}\n")
+        log = log_of(tmp_path, "time;x [cm]\n0,5;1,5\n1,5;2,5\n")
+        assert (log.times.tolist(), log.columns["x"].tolist()) == ([0.5, 1.5], [1.5, 2.5])
+
+    @pytest.mark.parametrize(
+        ("text", "fact"),
+        [
+            ("time,x,x\n0,1,2\n", "two columns 'x'"),
+            ("time,x [m],x [cm]\n0,1,2\n", "two columns 'x'"),
+            ("time [h],x\n0,1\n1,2\n", "'time' of seconds"),
+            ("time,x\n0,1\n,2\n", "row 3, column 'time'.*finite"),
+        ],
+    )
+    def test_mistakes(self, tmp_path, text, fact):
+        with pytest.raises(ConfigError, match=fact):
+            log_of(tmp_path, text)
+
+    def test_parquet(self, tmp_path):
+        pd = pytest.importorskip("pandas", reason="needs the extra pandas")
+        pytest.importorskip("pyarrow", reason="needs the extra parquet")
+        index = pd.date_range("2023-03-01", periods=3, freq="h", tz="Europe/Berlin", name="time")
+        pd.DataFrame({"x": [1.0, None, 3.0]}, index).to_parquet(tmp_path / "x.parquet")
+        log = PlantLog.read(tmp_path / "x.parquet")
+        assert log.times.tolist() == [59 * 86400.0 + 3600 * k for k in range(3)]
+        np.testing.assert_array_equal(log.columns["x"], [1, np.nan, 3])

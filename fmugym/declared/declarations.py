@@ -6,6 +6,7 @@ import keyword
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from typing import Any, Final, TypeVar
 
@@ -31,6 +32,7 @@ from fmugym.declared.parts import (
 from fmugym.declared.series import read_data
 from fmugym.declared.setpoints import SetPoints
 from fmugym.declared.spelling import as_declared
+from fmugym.declared.standard_time import standard_time
 from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, start_value
 from fmugym.declared.warming import read_warm_up
 from fmugym.errors import ConfigError
@@ -87,7 +89,7 @@ class Declarations:
         _check_names(root)
         self.memory = _read(root, "memory", read_memory)
         self.derived = _read(root, "expressions", read_derived)
-        self.series = _read(root, "data", read_data)
+        self.series = _read(root, "data", partial(read_data, standard=_standard_offset(root)))
         self._read_setpoints()
         parameters = _read(root, "parameters", self._parameter)
         self.parameters = self._with_fitted({v.alias: (v, one) for v, one in parameters.values()})
@@ -359,6 +361,13 @@ class Declarations:
             if not self.knows_actions and variable.fmu_variable.causality == "input":
                 return
             self.variables.check_output(entry, entry.value)
+
+
+def _standard_offset(root: Entry) -> int | None:
+    """The offset of the standard time; None if nothing tells it, or files differ in it."""
+    with root.child("timezone").noting():
+        return standard_time(root).offset
+    return None
 
 
 def _check_action(variable: TaskVariable) -> None:

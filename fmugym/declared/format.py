@@ -23,6 +23,7 @@ from fmugym.checks import (
     integer_of,
 )
 from fmugym.config import CONFIG, FOREIGN
+from fmugym.declared.dates import moment_of_year, zone_of
 from fmugym.declared.expressions import Expression
 from fmugym.declared.quantities import constant_of, finite, number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
@@ -55,6 +56,7 @@ VERSION: Final = 1
 
 _DATE: Final = re.compile(r"(?:\d{4}-)?(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2}))?")
 _LIKE_A_DATE: Final = re.compile(r"\d+-\d+")
+_FULL_DATE: Final = re.compile(r"\s*\d{4}-\d\d")
 _ANY_YEAR: Final = 2001  # without a leap day
 _DAY: Final = 86400.0
 _MOST_LEVELS: Final = 10_000
@@ -109,6 +111,40 @@ def _bias(what: str, value: Any) -> Any:
     return found
 
 
+def _values(what: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Finite numbers; None is a value that is missing, and becomes NaN."""
+    is_missing = [one is None for one in value] if isinstance(value, list | tuple) else []
+    if any(is_missing):
+        value = [0.0 if one is None else one for one in value]
+    numbers = _numbers(what, value)
+    if not np.isfinite(numbers).all():
+        place = int(np.flatnonzero(~np.isfinite(numbers))[0])
+        raise ConfigError(f"{what} must be finite, but number {place + 1} is {numbers[place]}")
+    return np.where(is_missing, np.nan, numbers) if any(is_missing) else numbers
+
+
+def _times(what: str, value: Any) -> Any:
+    """Numbers of seconds, or dates, which ``fmugym.declared.dates`` reads."""
+    is_list = isinstance(value, list | tuple) and len(value) > 0
+    return value if is_list and _is_date(value[0]) else _numbers(what, value)
+
+
+def _is_date(value: Any) -> bool:
+    is_text = isinstance(value, str) and _FULL_DATE.match(value) is not None
+    return is_text or isinstance(value, datetime.date)
+
+
+def _gaps(what: str, value: Any) -> float:
+    if value == "interpolate":
+        return math.inf
+    try:
+        return check_number(what, _time(what, value), positive=True)
+    except ConfigError:
+        raise ConfigError(
+            f"{what} must be a positive time such as '6h', or 'interpolate', got {shown(value)}"
+        ) from None
+
+
 def _numbers(what: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     if not isinstance(value, list | tuple):
         raise ConfigError(f"{what} must be a list of numbers, got {shown(value)}")
@@ -136,7 +172,7 @@ def _moment(what: str, value: Any) -> float:
     """Seconds since the beginning of a year of 365 days, of a duration or of a date."""
     given = value
     if isinstance(value, datetime.date):  # TOML has dates of its own
-        value = value.isoformat()[:16]
+        return _moment_of(what, value)
     match = _DATE.fullmatch(value) if isinstance(value, str) else None
     if match is None and not _LIKE_A_DATE.match(str(value)):
         return _time(what, value)
@@ -148,6 +184,18 @@ def _moment(what: str, value: Any) -> float:
             f"expected a date such as '01-15' or '01-15 06:00', got {shown(given)}"
         ) from None
     return (date - datetime.datetime(_ANY_YEAR, 1, 1)).total_seconds()
+
+
+def _moment_of(what: str, date: datetime.date) -> float:
+    if getattr(date, "tzinfo", None) is not None:
+        raise ConfigError(
+            f"{what} is on the standard time of the task: leave the offset out, got "
+            f"{shown(str(date))}"
+        )
+    if (date.month, date.day) == (2, 29):
+        raise ConfigError(f"the year of {what} has 365 days, got {shown(str(date))}")
+    day = datetime.datetime(date.year, date.month, date.day)
+    return moment_of_year(date if isinstance(date, datetime.datetime) else day)
 
 
 def _moments(what: str, value: Any) -> Any:
@@ -209,12 +257,19 @@ TIME_OR_DRAWN: Final = Kind(
     partial(number_or_distribution, read=_time), {**_DRAWN, "title": "time, distribution"}
 )
 NUMBERS: Final = Kind(_numbers, _NUMBERS)
+VALUES: Final = Kind(_values, _NUMBERS)
 NAMES: Final = Listed(TEXT, or_one=True, most=_MOST_NAMES)
 PATH: Final = Kind(_path, {"title": "path", **TEXT.schema}, "path")
 CONTROLLER: Final = Kind(
     lambda _, value: value, {"title": "text, number", "type": ["string", "number"]}
 )
 MOMENT: Final = Kind(_moment, _MOMENT)
+TIMES: Final = Kind(
+    _times,
+    {"title": "list of numbers, dates", "type": "array", "items": {"type": ["number", "string"]}},
+)
+TIMEZONE: Final = Kind(zone_of, TEXT.schema)
+GAPS: Final = Kind(_gaps, {"title": '"interpolate", time', "type": ["number", "string"]})
 
 _LIMITS: Final = {
     "min": Key(NUMBER, "Lower limit for the observation space.", None, "no limit"),
@@ -420,8 +475,8 @@ DATA: Final = Table(
     {
         "file": Key(
             PATH,
-            "The file. Commas or semicolons separate cells of a CSV file. A file whose name ends "
-            "with `.parquet` needs the extra `parquet`. [Weather](task-file.md#weather) of "
+            "The file. Commas, semicolons or tabs separate cells of a CSV file. A file whose name "
+            "ends with `.parquet` needs the extra `parquet`. [Weather](task-file.md#weather) of "
             "EnergyPlus and [tables of Modelica](task-file.md#tables-of-modelica) are known by "
             "their first line.",
         ),
@@ -442,8 +497,21 @@ DATA: Final = Table(
             None,
             "a column called time, datetime, timestamp or date",
         ),
-        "values": Key(NUMBERS, "Values, instead of a file; in a dict, an array will do."),
-        "times": Key(NUMBERS, "Their times in seconds, unless there is a `step`."),
+        "timezone": Key(
+            TIMEZONE,
+            "[The zone](task-file.md#time-zones-and-leap-years) of dates that have no offset from "
+            'UTC: `"Europe/Berlin"`, or `"+01:00"`.',
+            None,
+            "the task's standard time",
+        ),
+        "values": Key(
+            VALUES, "Values, instead of a file; in a dict, an array or a column of pandas will do."
+        ),
+        "times": Key(
+            TIMES,
+            "Their times: seconds, or dates, unless there is a `step`; in a dict, also an index of "
+            "pandas.",
+        ),
         "step": Key(POSITIVE_TIME, "Time between rows, instead of a column with times."),
         "period": Key(
             TIME,
@@ -456,6 +524,13 @@ DATA: Final = Table(
             option("linear", "previous"),
             'How values between rows are found; `"previous"`: a value holds until the next row.',
             "linear",
+        ),
+        "gaps": Key(
+            GAPS,
+            'The longest time from a value to the next one, such as `"6h"`; `"interpolate"` for no '
+            "limit.",
+            None,
+            "[twice the distance](task-file.md#gaps) of rows that are regular; weather: a day",
         ),
         "unit": Key(TEXT, "Unit of the values."),
         "input": Key(
@@ -698,7 +773,8 @@ PLANT: Final = Table(
             TAG,
             "The plant's time, in seconds since the beginning of the year.",
             None,
-            "the local time of this machine",
+            "the time of this machine: the task's "
+            "[standard time](task-file.md#time-zones-and-leap-years), or else local time",
         ),
         "poll": Key(POSITIVE_TIME, "Time from one reading to the next.", None, "a tenth of a step"),
         "stale_after": Key(
@@ -719,7 +795,7 @@ PLANT: Final = Table(
         "data": Key(
             Entries(LIVE),
             "By name, where the data that the agent sees come from: a file that something else "
-            "refreshes (keys as in `data`, times in seconds of the year), or a tag.",
+            "refreshes (keys as in `data`, times in seconds of the year or dates), or a tag.",
         ),
         "encryption": Key(FLAG, "OPC UA: whether messages are signed and encrypted.", True),
         "certificate": Key(PATH, "OPC UA: this client's certificate."),
@@ -851,6 +927,13 @@ TASK: Final = Table(
             "The [time of data](task-file.md#clock-and-scenarios) at the beginning of an episode.",
             None,
             "the FMU's time",
+        ),
+        "timezone": Key(
+            TIMEZONE,
+            "The [standard time](task-file.md#time-zones-and-leap-years) of the clock: an offset "
+            'from UTC such as `"+01:00"`, or a zone, whose winter time it is.',
+            None,
+            "that of the weather file, or else the smallest offset in the data",
         ),
         "scenarios": Key(
             Entries(SCENARIO, _MOST_NAMES), "[Scenarios](task-file.md#clock-and-scenarios) by name."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import os
 import re
 import sys
@@ -361,16 +362,39 @@ def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """The value in types that a file can hold, as far as that is possible."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items() if item is not None}
+        items = _with_index(value)
+        return {str(key): _plain(item) for key, item in items.items() if item is not None}
     if isinstance(value, Uniform | LogUniform | Normal | Choice):
         return _plain(asdict(value))
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
         return value.tolist()
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind == "M":
+        return value.astype("M8[us]").tolist()
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O" and value.ndim == 1:
+        return [_plain(item) for item in value]
+    if _is_column(value):
+        missing = [*value.isna()]
+        return [None if gone else _plain(one) for one, gone in zip(value, missing, strict=True)]
+    if isinstance(value, datetime.datetime) and hasattr(value, "to_pydatetime"):
+        return value.to_pydatetime(warn=False)
     if isinstance(value, type):
         return _named(value)
     return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def _is_column(value: Any) -> bool:
+    """Whether a value is a column or an index of pandas."""
+    return getattr(value, "ndim", None) == 1 and hasattr(type(value), "isna")
+
+
+def _with_index(items: Mapping[Any, Any]) -> Mapping[Any, Any]:
+    """A table in which a column of pandas as ``values`` brings the dates of its index."""
+    index = getattr(items.get("values"), "index", None)
+    if not _is_column(index) or items.keys() & {"times", "step"}:
+        return items
+    return {**items, "times": index}
 
 
 def _grouped(document: dict[str, Any]) -> dict[str, Any]:

@@ -13,22 +13,18 @@ import datetime
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from fmugym.declared.data_tables import Column, Table
+from fmugym.declared.dates import DAY, HOUR, YEAR, FloatArray
 from fmugym.errors import ConfigError, reading, shown
 
-__all__ = ["Cells", "FloatArray", "Table", "read_modelica", "read_weather"]
+__all__ = ["read_modelica", "read_weather"]
 
-FloatArray = npt.NDArray[np.float64]
-
-Cells = Sequence[Any] | FloatArray
-"""The cells of a column: texts of a CSV file, values of a Parquet file, numbers."""
-
-_HOUR: Final = 3600.0
-_DAY: Final = 86400.0
 _ANY_YEAR: Final = 2001  # a year of the clock has no leap day
 
 _BEFORE_JUMP: Final = 1e-9
@@ -75,6 +71,11 @@ _CODES_OF_TABLES: Final = {**_CODES, "Wind Direction": math.inf}
 _MEANS: Final = ("Radiation", "Illuminance", "Luminance")
 """How the names of fields end that are means of the time since the row before."""
 
+_PLACE_OF_OFFSET: Final = 8
+"""The cell of the line of the place with the hours from UTC."""
+
+_MOST_HOURS: Final = 24
+
 _WIDTH: Final = len(_DATES) + len(_CODES)
 _PERIODS: Final = re.compile(r"^DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,.*)?$", re.M)
 _TABLE: Final = re.compile(
@@ -82,26 +83,12 @@ _TABLE: Final = re.compile(
 )
 
 
-class Table(NamedTuple):
-    """The columns of a file.
-
-    Attributes:
-        columns: The cells of each column by name, in the order of the file. NaN is a number that
-            is missing.
-        period: Seconds after which the rows repeat; None for one more row than there are.
-        means: By name, for columns of means, the seconds before a row that it is the mean of.
-    """
-
-    columns: Mapping[str, Cells]
-    period: float | None = None
-    means: Mapping[str, float] = {}
-
-
 def read_weather(name: str, lines: Sequence[str]) -> Table:
     """Read weather of EnergyPlus.
 
     Times are those of the file: local standard time, from the beginning of a year of 365 days. The
-    years of the rows do not count, because those of typical months differ.
+    years of the rows do not count, because those of typical months differ; after December comes
+    January of the next year.
 
     Args:
         name: What the file is called.
@@ -111,48 +98,79 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
         ConfigError: If they are no such weather.
     """
     with reading(f"{name} is no weather of EnergyPlus"):
-        per_hour, numbers = _records("\n".join(lines))
-        times = [_end_of(row, i % per_hour + 1, per_hour) for i, row in enumerate(numbers)]
-        return _weather((*_DATES, *_CODES), numbers, np.array(times), _CODES)
+        per_hour, fields = _fields(name, "\n".join(lines))
+        dates = zip(*(fields[key].numbers.tolist() for key in _DATES[1:4]), strict=True)
+        times = np.array(
+            [_end_of(date, i % per_hour + 1, per_hour) for i, date in enumerate(dates)]
+        )
+        times += YEAR * np.cumsum(np.diff(times, prepend=times[0]) < -YEAR / 2)
+        return _weather([*fields.values()], times, _CODES, lines)
 
 
-def _records(text: str) -> tuple[int, FloatArray]:
-    """How many there are in an hour, and their numbers, without those of a leap day."""
+def _fields(name: str, text: str) -> tuple[int, dict[str, Column]]:
+    """How many records there are in an hour, and the fields of those not of 29 February."""
     head = _PERIODS.search(text)
-    lines = text[head.end() :].splitlines() if head else []
-    rows = [line.split(",")[:_WIDTH] for line in lines if line.strip()]
-    widths = {len(row) for row in rows}
-    if head is None or len(widths) != 1:
+    above = text.count("\n", 0, head.end()) + 1 if head else 0
+    lines = enumerate(text.split("\n")[above:] if head else [], above + 1)
+    records = {number: line.split(",")[:_WIDTH] for number, line in lines if line.strip()}
+    if head is None or len({*map(len, records.values())}) != 1:
         raise ValueError(
             f"expected rows of {_WIDTH} cells below a line such as 'DATA PERIODS,1,1,Data,Sunday,"
             "1/1,12/31'"
         )
-    cells = [[cell.strip() or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
-    numbers = np.array(cells, np.float64)
-    return int(head[1]), numbers[(numbers[:, 1:3] != (2, 29)).any(axis=1)]
+    kept = {n: one for n, one in records.items() if not _is_leap_day(one)}
+    columns = zip((*_DATES, *_CODES), zip(*kept.values(), strict=True), strict=False)
+    fields = {key: Column(name, key, cells, [*kept]) for key, cells in columns}
+    flags = _DATES[-1]
+    return int(head[1]), fields | {flags: replace(fields[flags], cells=np.full(len(kept), np.nan))}
 
 
-def _end_of(row: FloatArray, part: int, parts: int) -> float:
+def _is_leap_day(record: Sequence[str]) -> bool:
+    return [cell.strip().lstrip("0") for cell in record[1:3]] == ["2", "29"]
+
+
+def _offset(lines: Sequence[str]) -> int | None:
+    """The offset from UTC that the line of the place tells, in seconds; None if it tells none."""
+    line = next((one for one in lines if one.lstrip("#").startswith("LOCATION,")), "")
+    cells = line.split(",")
+    with suppress(IndexError, ValueError):
+        hours = float(cells[_PLACE_OF_OFFSET])
+        return round(hours * HOUR) if abs(hours) < _MOST_HOURS else None
+    return None
+
+
+def _end_of(date: Sequence[float], part: int, parts: int) -> float:
     """When a record ends. Hour 1 is the first of a day; minutes mean several things in practice."""
-    month, day, hour = map(int, row[1:4])
+    month, day, hour = map(int, date)
     if not 1 <= hour <= 24:
         raise ValueError(f"expected hours from 1 to 24, got {hour}")
     days = datetime.date(_ANY_YEAR, month, day).timetuple().tm_yday - 1
-    return days * _DAY + (hour - 1 + part / parts) * _HOUR
+    return days * DAY + (hour - 1 + part / parts) * HOUR
 
 
 def _weather(
-    names: Sequence[str], rows: FloatArray, times: FloatArray, codes: Mapping[str, float]
+    fields: Sequence[Column], times: FloatArray, codes: Mapping[str, float], lines: Sequence[str]
 ) -> Table:
-    """Weather of rows of fields. It lasts whole days, with a row for its first midnight or not."""
-    found = zip(names, rows.T, strict=False)  # the last fields may be missing
-    columns = {
-        name: np.where(values < codes.get(name, math.inf), values, np.nan) for name, values in found
-    }
-    period = math.ceil((times[-1] - times[0]) / _DAY) * _DAY
-    step = float(np.diff(times[:2]).sum())
-    means = {name: step for name in columns if name.endswith(_MEANS)}
-    return Table({**columns, "time": times}, period, means)
+    """Weather of fields. It lasts whole days, with a row for its first midnight or not."""
+    fields = [one for one in fields if one.name != "time"]
+    columns = [_without(one, codes.get(one.name, math.inf)) for one in fields]
+    time = replace(fields[0], name="time", cells=times, of_year=True)
+    return Table(
+        [*columns, time] if _DATES[0] in fields[0].name else [time, *columns],
+        period=math.ceil((times[-1] - times[0]) / DAY) * DAY,
+        means={one.name: float(np.diff(times[:2]).sum()) for one in columns if _is_mean(one)},
+        longest_gap=DAY,
+        offset=_offset(lines),
+    )
+
+
+def _without(field: Column, code: float) -> Column:
+    """A field without the values that say that one is missing."""
+    return replace(field, cells=np.where(field.numbers < code, field.numbers, np.nan))
+
+
+def _is_mean(field: Column) -> bool:
+    return field.name.endswith(_MEANS)
 
 
 def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
@@ -169,25 +187,31 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
     Raises:
         ConfigError: If there is no table, or its numbers are not as many as it says.
     """
-    is_weather = any(line.startswith("#LOCATION,") for line in lines)
     _, *parts = _TABLE.split("\n".join(line.partition("#")[0] for line in lines))
     if not parts:
         raise ConfigError(f"{name} has no table, such as 'double tab1(8760,2)'")
+    head = [line for line in lines if line.startswith("#LOCATION,")]
     return {
-        key: _modelica_table(f"the table {shown(key)} of {name}", (rows, width), cells, is_weather)
+        key: _modelica_table(
+            f"the table {shown(key)} of {name}", int(rows), int(width), cells, head
+        )
         for key, rows, width, cells in zip(*(parts[i::4] for i in range(4)), strict=True)
     }
 
 
-def _modelica_table(what: str, shape: tuple[str, str], cells: str, is_weather: bool) -> Table:
-    with reading(f"{what} is damaged"):
-        numbers = np.array(cells.translate(str.maketrans(",;", "  ")).split(), np.float64)
-        numbers = numbers.reshape(*map(int, shape))
-    times, width = numbers[:, 0], len(numbers.T)
+def _modelica_table(what: str, rows: int, width: int, text: str, head: Sequence[str]) -> Table:
+    cells = text.translate(str.maketrans(",;", "  ")).split()
+    if len(cells) != rows * width:
+        raise ConfigError(f"{what} has {len(cells)} numbers, expected a shape of ({rows}, {width})")
+    is_weather = bool(head) and width == 1 + len(_CODES)
+    names = ("time", *_CODES) if is_weather else ("time", *map(str, range(2, width + 1)))
+    numbers = range(1, rows + 1)
+    columns = [Column(what, name, cells[i::width], numbers) for i, name in enumerate(names)]
+    times, *_ = [column.numbers for column in columns]
     period = float(times[-1] - times[0])
     is_left = np.append(np.diff(times) == 0, True)  # the first row comes again after the last one
     times = times - _BEFORE_JUMP * period * is_left
-    if is_weather and width == 1 + len(_CODES):
-        return _weather(("time", *_CODES), numbers, times, _CODES_OF_TABLES)
-    columns = dict(zip(("time", *map(str, range(2, width + 1))), numbers.T, strict=True))
-    return Table(columns | {"time": times}, period or _DAY)
+    if is_weather:
+        return _weather(columns, times, _CODES_OF_TABLES, head)
+    columns[0] = replace(columns[0], cells=times)
+    return Table(columns, period=period or DAY, offset=_offset(head))

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.declared.dates import moment_of_year
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.plant.live import Live
@@ -27,10 +28,14 @@ _LATE: Final = 2.0
 """How late a thread or an answer may be, in seconds of real time."""
 
 
-def _local_time() -> float:
-    """The seconds since the beginning of the year, in the time of this place."""
-    now = datetime.datetime.now()
-    return (now - datetime.datetime(now.year, 1, 1)).total_seconds()
+def _time_of_year(now: datetime.datetime, offset: int | None) -> float:
+    """The seconds since the beginning of the year, on a standard time or that of this place."""
+    zone = None if offset is None else datetime.timezone(datetime.timedelta(seconds=offset))
+    return moment_of_year(now.astimezone(zone))
+
+
+def _now() -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC)
 
 
 class Feed:
@@ -55,7 +60,7 @@ class Feed:
     plant: Plant
 
     def __init__(self, clock: Clock) -> None:
-        self.clock, self._start = clock, _local_time() - clock.time()
+        self.clock, self._begun = clock, (_now(), clock.time())
         self.values: dict[str, tuple[float, ...]] = {}
         self.faults: dict[str, str] = {}
         self.has_expired, self.time, self.jump = False, 0.0, 0.0
@@ -178,8 +183,11 @@ class Feed:
         if "clock" in self._asked:
             return self.values["clock"][0] - self._asked["clock"]
         if speed_of(self.clock) == 1.0:
-            return _local_time() - self.clock.time()
-        return self._start  # a clock that runs faster began with the time of this place
+            return _time_of_year(_now(), self.plant.standard) - self.clock.time()
+        start, ticks = self._begun
+        return (
+            _time_of_year(start, self.plant.standard) - ticks
+        )  # a clock that runs faster began with the time of this place
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.units import conversion_between
+from fmugym.declared.data_rows import read_rows
 from fmugym.declared.entries import Entry
-from fmugym.declared.series import read_rows
 from fmugym.errors import ConfigError, shown
 from fmugym.logs import declared_as
 from fmugym.plant.tags import DATA, Plant
@@ -34,6 +34,7 @@ class Live:
     def __init__(self, envs: Sequence[Any], plant: Plant) -> None:
         self._envs = envs
         root = envs[0].task.root
+        self._standard = plant.standard
         self._entries = plant.entry.child("data").items()
         self._ahead = {name: horizon(root, name) for name in self._entries}
         for name in sorted(_seen(root)):
@@ -88,7 +89,10 @@ class Live:
         if "file" not in entry.value:
             values = np.array(tags[DATA + name])
             return now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values
-        times, values = read_rows(entry)
+        rows = read_rows(entry, self._standard)
+        with entry.placing():
+            rows.require_no_gap(None)
+        times, values = rows.known()
         given, own = entry.value.get("unit"), self._own[name]
         unit: Any = conversion_between(given, own, self._units)
         values = unit.of_differences(name in self._relative)(values)

@@ -70,7 +70,7 @@ class _Twin:
         self._read_all = quantities.read
         self._quantities = {one.name: one for one in quantities.all}
         self._sensors = self._places_of_sensors()
-        self._data = {name: read_data(entry) for name, entry in data.items()}
+        self._data = {name: read_data(entry, self.plant.standard) for name, entry in data.items()}
         self.policy.begin()
         self._observation, _ = self.env.reset(seed=self.seed)
         self._begin, self._steps, self._reward = self.clock.time(), 0, 0.0

@@ -12,6 +12,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import Spellings
 from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
+from fmugym.declared.standard_time import standard_time
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.logs import declared_as
 
@@ -73,6 +74,8 @@ class Plant:
         tags: By name.
         step: The time step of the task in seconds.
         poll, stale_after, hold: In seconds.
+        standard: The offset of the task's standard time in seconds east of UTC; None if nothing
+            tells it.
     """
 
     entry: Entry
@@ -82,6 +85,7 @@ class Plant:
     poll: float
     stale_after: float
     hold: float
+    standard: int | None = None
 
     def __getitem__(self, key: str) -> Any:
         """The value of a key; None if it is not given."""
@@ -117,7 +121,8 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
     stale = entry.value.get("stale_after") or 3 * poll
     hold = entry.value.get("hold")
     address = address or entry.value["address"]
-    return Plant(entry, address, tags, step, poll, stale, step if hold is None else hold)
+    standard = standard_time(env.task.root).offset
+    return Plant(entry, address, tags, step, poll, stale, step if hold is None else hold, standard)
 
 
 def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:

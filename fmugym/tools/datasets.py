@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fmugym.declared import Task, load
+from fmugym.declared.standard_time import standard_time
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, simulate
@@ -20,9 +21,17 @@ from fmugym.recording import Recorder, Recording
 from fmugym.tools.options import MINARI, only_player, say_result
 from fmugym.tools.targets import maker_of
 
-__all__ = ["add_of_datasets", "dataset_of", "make_dataset", "renaming", "show_dataset"]
+__all__ = [
+    "add_of_datasets",
+    "add_timezone",
+    "dataset_of",
+    "make_dataset",
+    "read_log",
+    "renaming",
+    "show_dataset",
+]
 
-_OPTIONS: Final = ("log", "column", "tolerance", "author", "description")
+_OPTIONS: Final = ("log", "column", "timezone", "tolerance", "author", "description")
 
 
 def add_of_datasets(command: argparse.ArgumentParser) -> None:
@@ -40,6 +49,7 @@ def add_of_datasets(command: argparse.ArgumentParser) -> None:
         metavar="COLUMN=VARIABLE",
         help="a column of the log whose name is not that of the variable; more than once",
     )
+    add_timezone(group)
     group.add_argument(
         "--tolerance",
         type=float,
@@ -47,6 +57,26 @@ def add_of_datasets(command: argparse.ArgumentParser) -> None:
     )
     group.add_argument("--author", help="for the dataset's metadata")
     group.add_argument("--description", help="for the dataset's metadata")
+
+
+def add_timezone(command: Any) -> None:
+    """Add the option for logs with dates."""
+    command.add_argument(
+        "--timezone",
+        metavar="ZONE",
+        help="the zone of dates without an offset in a log, such as Europe/Berlin or +01:00",
+    )
+
+
+def read_log(path: str, arguments: argparse.Namespace) -> PlantLog:
+    """Read a log, whose dates are then on the standard time of the task.
+
+    Raises:
+        ConfigError: If the log or the task has a mistake.
+    """
+    has_file = str(arguments.task).lower().endswith(".toml")
+    standard = standard_time(Task.read(arguments.task).root).offset if has_file else None
+    return PlantLog.read(path, timezone=arguments.timezone, standard=standard)
 
 
 def dataset_of(arguments: argparse.Namespace) -> str | None:
@@ -104,7 +134,7 @@ def _logged(
         if path.endswith(".npz"):
             found.append(Recording.load(path))
             continue
-        log, seed, make = PlantLog.read(path), arguments.seed + len(found), make_env
+        log, seed, make = read_log(path, arguments), arguments.seed + len(found), make_env
         if log.proposed is not None:  # of the shadow of a plant, so in seconds of the year
             if arguments.scenario is not None:
                 raise ConfigError(f"{shown(path)} has its own periods: leave --scenario out")

@@ -17,8 +17,7 @@ from fmugym.files import replaced
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison
 from fmugym.identification.clock_shift import Shift, shift_of_clocks
-from fmugym.logs import PlantLog
-from fmugym.tools.datasets import renaming
+from fmugym.tools.datasets import add_timezone, read_log, renaming
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -58,6 +57,7 @@ def add_fit(commands: Commands) -> None:
         metavar="COLUMN=VARIABLE",
         help="a column of the log whose name is not that of the variable; more than once",
     )
+    add_timezone(command)
     command.add_argument(
         "--parameter",
         action="append",
@@ -106,7 +106,7 @@ def _fit(arguments: argparse.Namespace) -> None:
     with progress(None, "fit", "simulations") as advance:
         fit = fit_logs(
             make_env,
-            [PlantLog.read(path) for path in arguments.log],
+            [read_log(path, arguments) for path in arguments.log],
             dict(map(_range, arguments.parameter)),
             starts=dict(map(_start, arguments.start)),
             wash_in=None if wash_in is None else duration("--wash-in", wash_in),

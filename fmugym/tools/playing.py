@@ -15,9 +15,14 @@ from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import ConfigError, plain, reason
-from fmugym.logs import PlantLog
 from fmugym.signals import ordinary
-from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
+from fmugym.tools.datasets import (
+    add_of_datasets,
+    add_timezone,
+    dataset_of,
+    make_dataset,
+    read_log,
+)
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -157,6 +162,7 @@ def add_evaluate(commands: Commands) -> None:
         help="the record of a shadow (.csv): what the plant has reached, and what others reach on "
         "the FMU in the same periods",
     )
+    add_timezone(command)
     command.add_argument(
         "--plot", type=Path, metavar="FILE", help="a new picture of the rewards and costs"
     )
@@ -181,7 +187,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         if arguments.log is not None:
-            task, log = task_of(arguments), PlantLog.read(arguments.log)
+            task, log = task_of(arguments), read_log(arguments.log, arguments)
             with watched(1.0, "evaluate") as advance:
                 scores.extend(evaluate_log(task, log, players, advance, leave_out))
         else:

@@ -258,7 +258,7 @@ class TestParquet(TestFiles):
     @pytest.mark.parametrize(
         ("values", "column", "fact"),
         [
-            ((1.0, None, 2.0), {}, "row 3.*None"),
+            ((1.0, None, 2.0), {"gaps": "1h"}, "row 2.*row 4.*2 hours"),
             ((1, 2, 3), {"column": "note"}, "'a'"),
             ((1, 2, 3), {"column": "T_c"}, "'T_C'"),
         ],

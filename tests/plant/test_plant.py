@@ -1,9 +1,11 @@
 """Plants: an agent in the shadow of one, and an FMU that is one, by Modbus TCP."""
 
 import asyncio
+import datetime
 import json
 import re
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +35,10 @@ from fmugym.fit import fit_logs
 from fmugym.lab import RealClock
 from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
+from fmugym.plant.feed import _time_of_year
 from fmugym.plant.polling import LostError, Poller
+from fmugym.plant.serving import environment
+from fmugym.plant.tags import read_plant
 from fmugym.series import RecordSeries
 from fmugym.tools.shadows import evaluate_log
 
@@ -668,3 +673,29 @@ class TestCommands:
         Path(file).write_text(text.replace("\nT = {register", "\nTt = {register"))
         err = refused("simulate", file, "--plant")
         assert "plant.tags.Tt: unknown variable of the task 'Tt'" in err
+
+
+class TestClock:
+    """Without a tag for it, the plant has the time of this machine."""
+
+    @pytest.mark.parametrize(
+        ("offset", "expected"),
+        [(3600, "2023-07-01 13:00"), (-3600, "2023-07-01 11:00"), (0, "2023-07-01 12:00")],
+    )
+    def test_is_on_standard_time(self, offset, expected):
+        now = datetime.datetime(2023, 7, 1, 12, tzinfo=datetime.UTC)
+        since = datetime.datetime.fromisoformat(expected) - datetime.datetime(2023, 1, 1)
+        assert _time_of_year(now, offset) == since.total_seconds()
+        assert _time_of_year(now.replace(year=2024), offset) == since.total_seconds()
+
+    def test_is_on_local_time_if_nothing_tells_the_standard_time(self):
+        now = datetime.datetime(2023, 7, 1, 12, tzinfo=datetime.UTC)
+        local = now.astimezone().replace(tzinfo=None) - datetime.datetime(2023, 1, 1)
+        assert _time_of_year(now, None) == local.total_seconds()
+
+    @pytest.mark.parametrize(("given", "offset"), [({"timezone": "+02:00"}, 7200), ({}, None)])
+    def test_the_task_tells_the_standard_time(self, given, offset):
+        task = house()
+        env = environment(replace(task, document={**task.document, **given}))
+        assert read_plant(env).standard == offset
+        env.close()

@@ -1,0 +1,239 @@
+"""Tables: columns of cells, which are read as numbers or dates."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.checks import check_integer
+from fmugym.declared.dates import Dates, FloatArray, IntArray, shown_date, zone_of
+from fmugym.errors import ConfigError, first_of, shown, unknown_name
+
+__all__ = ["Column", "Table"]
+
+Cells = Sequence[Any] | npt.NDArray[Any]
+"""The cells of a column: texts of a CSV file, numbers, or timestamps."""
+
+_NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
+_INDEX: Final = ("", "__index_level_0__")
+"""How files of pandas call an index without a name, in CSV and in Parquet."""
+
+_BLANKS: Final = " \t\r\n"
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """A column of a table.
+
+    Attributes:
+        table: The name of the file; "" for lists.
+        name: Its name.
+        cells: Texts, numbers, or moments of numpy.
+        rows: The numbers of its rows in the file, shape (n,).
+        zone: Of moments, which are then those of UTC; None if they have none.
+        may_have_commas: Whether a number may have a decimal comma.
+        of_year: Whether its numbers are seconds of the year, which an error shows as dates.
+    """
+
+    table: str
+    name: str
+    cells: Cells
+    rows: Sequence[int] | IntArray
+    zone: str | None = None
+    may_have_commas: bool = False
+    of_year: bool = False
+
+    def told(self, index: int) -> str:
+        """Say where a cell stands."""
+        file = f"{self.table}, " if self.table else ""
+        return f"{file}row {self.rows[index]}, column {shown(self.name)}"
+
+    def when(self, index: int) -> str:
+        """Say which row that is, and at which time, if this is the column of times."""
+        if not self.is_numeric:
+            time = shown_date(self.dates.walls[index])
+        elif self.of_year:
+            seconds = round(float(self.numbers[index]) * 1e6)
+            time = shown_date(seconds % (365 * 86400 * 10**6)).removeprefix("1970-")
+        else:
+            time = _seconds(float(self.numbers[index]))
+        return f"row {self.rows[index]} ({time})"
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its first cell that is not empty is a number."""
+        if isinstance(self.cells, np.ndarray):
+            return self.cells.dtype.kind == "f"
+        first = next((one for one in self.cells if not _is_blank(one)), "")
+        return _is_number(_pointed(first) if self.may_have_commas else first)
+
+    @cached_property
+    def has_commas(self) -> bool:
+        """Whether its numbers have decimal commas."""
+        return self.may_have_commas and any("," in str(cell) for cell in self.cells)
+
+    @cached_property
+    def numbers(self) -> FloatArray:
+        """Its numbers, shape (n,); NaN where a cell is empty.
+
+        Raises:
+            ConfigError: If a cell is no number.
+        """
+        if isinstance(self.cells, np.ndarray) and self.cells.dtype.kind == "f":
+            return self.cells
+        numbers = self._read_numbers()
+        numbers.setflags(write=False)
+        return numbers
+
+    def _read_numbers(self) -> FloatArray:
+        cells: Sequence[Any] = self.cells  # type: ignore[assignment]
+        if self.has_commas:
+            cells = self._with_points()
+        with suppress(TypeError, ValueError):
+            joined = "".join(cells)
+            if _is_plain(joined):
+                return np.array([*map(float, cells)])
+        return np.array([self._number(i, cell) for i, cell in enumerate(cells)], np.float64)
+
+    def _with_points(self) -> list[str]:
+        points = (i for i, cell in enumerate(self.cells) if "." in str(cell))
+        if (point := next(points, None)) is not None:
+            comma = next(i for i, cell in enumerate(self.cells) if "," in str(cell))
+            raise ConfigError(
+                f"{self.told(point)}: a column has decimal points or decimal commas, but here is "
+                f"{shown(self.cells[point])}, and {shown(self.cells[comma])} in row "
+                f"{self.rows[comma]}"
+            )
+        return [str(cell).replace(",", ".") for cell in self.cells]
+
+    def _number(self, index: int, cell: Any) -> float:
+        if _is_blank(cell):
+            return np.nan
+        if _is_number(cell):
+            return float(cell)
+        hint = "; leave the cell empty if there is none"
+        if isinstance(cell, str) and _is_number(_pointed(cell)):
+            hint = "; a decimal comma needs ';' or a tab between cells"
+        raise ConfigError(f"{self.told(index)}: expected a number, got {shown(cell)}{hint}")
+
+    @cached_property
+    def dates(self) -> Dates:
+        """Its dates.
+
+        Raises:
+            ConfigError: If a cell is none, or only some have an offset from UTC.
+        """
+        cells = self.cells
+        if not isinstance(cells, np.ndarray) or cells.dtype.kind != "M":
+            return Dates.of([*cells], self.told)
+        if np.isnat(cells).any():
+            raise ConfigError(f"{self.told(int(np.isnat(cells).argmax()))}: the time is missing")
+        moments = cells.astype("M8[us]").astype(np.int64)
+        if self.zone is None:
+            return Dates(moments)
+        return Dates.of_instants(moments, zone_of("the time zone of the file", self.zone))
+
+    def dates_in(self, zone: datetime.tzinfo | None) -> Dates:
+        """Its dates, those without an offset from UTC as a zone has them.
+
+        Raises:
+            ConfigError: As ``dates``; or if a date does not tell its offset there, or without a
+                zone, if an hour of daylight saving time is missing.
+        """
+        dates = self.dates
+        if dates.offsets is None and zone is not None:
+            dates = dates.localized(zone, self.told)
+        dates.require_no_daylight_saving(self.told)
+        return dates
+
+
+def _seconds(seconds: float) -> str:
+    text = f"{seconds:.6f}".rstrip("0").rstrip(".") if abs(seconds) >= 1 else f"{seconds:.10g}"
+    return f"{text} s"
+
+
+def _is_blank(cell: Any) -> bool:
+    return cell is None or (isinstance(cell, str) and not cell.strip(_BLANKS))
+
+
+def _is_plain(text: str) -> bool:
+    """Whether Python reads no more than decimal numbers in a text: no Arabic digits, no 1_000."""
+    return text.isascii() and "_" not in text
+
+
+def _pointed(cell: Any) -> Any:
+    return cell.replace(",", ".") if isinstance(cell, str) else cell
+
+
+def _is_number(cell: Any) -> bool:
+    try:
+        float(cell)
+    except (TypeError, ValueError):
+        return False
+    return not isinstance(cell, str) or _is_plain(cell.strip(_BLANKS))
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The columns of a file.
+
+    Attributes:
+        columns: In the order of the file.
+        separator: What stands between cells, in words; "" where nothing does.
+        period: Seconds after which the rows repeat; None for one more row than there are.
+        means: By name, for columns of means, the seconds before a row that it is the mean of.
+        longest_gap: The longest time without a value, in seconds; None if nothing is known.
+        offset: That of its times, in seconds east of UTC, if its header tells it.
+    """
+
+    columns: Sequence[Column]
+    separator: str = ""
+    period: float | None = None
+    means: Mapping[str, float] = field(default_factory=dict)
+    longest_gap: float | None = None
+    offset: int | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the columns."""
+        return [column.name for column in self.columns]
+
+    def find(self, key: str | int) -> Column:
+        """Find a column by its name, or by its number from 1 on.
+
+        Raises:
+            ConfigError: If there is none, or there are several of the name.
+        """
+        if not isinstance(key, str):
+            return self.columns[check_integer("column", key, 1, len(self.columns)) - 1]
+        numbers = [i for i, name in enumerate(self.names, 1) if name == key]
+        if len(numbers) > 1:
+            places = ", ".join(map(str, numbers))
+            raise ConfigError(
+                f"{len(numbers)} columns are called {shown(key)}: give the number of one ({places})"
+            )
+        if not numbers:
+            raise unknown_name("column", key, self.names)
+        return self.columns[numbers[0] - 1]
+
+    def find_time(self) -> Column | None:
+        """Find the column of times by its usual names; None if there is none.
+
+        Raises:
+            ConfigError: If there are several of a name.
+        """
+        for word in _NAMES_OF_TIME:
+            found = [column for column in self.columns if column.name.lower() == word]
+            if len(found) > 1:
+                names = first_of([shown(column.name) for column in found])
+                raise ConfigError(f"name the column with the times as 'time': there are {names}")
+            if found:
+                return found[0]
+        return next((c for c in self.columns if c.name in _INDEX and not c.is_numeric), None)
