@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Final
 
 from fmugym.archive.fmu import FMU
+from fmugym.declared import Task
 from fmugym.declared.format import SCHEMA
 from fmugym.errors import ConfigError, plain
 from fmugym.repair.compiling import compile_fmu
 from fmugym.repair.stand_in import build_stand_in, replaceable
 from fmugym.systems import FMUSystem
+from fmugym.tools.data_overview import data_as_text, overview_of_data
 from fmugym.tools.datasets import show_dataset
 from fmugym.tools.options import (
     MINARI,
@@ -43,6 +45,7 @@ __all__ = ["add_info", "add_new", "add_validate"]
 
 
 _SCHEMA_NAME: Final = "fmugym.schema.json"
+_NO_DATA: Final = {"series": (), "error": None}
 _SCHEMA_LINE: Final = f"#:schema ./{_SCHEMA_NAME}\n"
 """It tells editors what keys mean. A file beside the task works offline and elsewhere, too."""
 
@@ -104,10 +107,12 @@ def _info(arguments: argparse.Namespace) -> None:
         facts, as_lines = overview(model, **wanted), as_text
     else:
         raise ConfigError("--plot is for systems; an FMU alone has no connections to draw")
+    if path.suffix.lower() == ".toml":
+        facts["data"] = overview_of_data(Task.read(path))
     if arguments.json:
         say_json(facts)
     else:
-        say(as_lines(facts))
+        say("\n".join([as_lines(facts), *data_as_text(facts.get("data", _NO_DATA))]))
 
 
 def _repair(arguments: argparse.Namespace, fmu: FMU) -> None:
