@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import math
 import random
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import PurePath
-from types import CellType, FunctionType, MappingProxyType, MethodType, ModuleType
+from types import (
+    BuiltinMethodType,
+    CellType,
+    FunctionType,
+    MappingProxyType,
+    MethodType,
+    ModuleType,
+    SimpleNamespace,
+)
 from typing import Any, Final, NamedTuple
 
 import gymnasium
@@ -151,7 +160,10 @@ def _places_outside(env: FMUEnv) -> Iterator[tuple[dict[str, Any], str]]:
     Instances of classes of other packages are left out: they may lead anywhere.
     """
     seen: set[tuple[int, str]] = set()
+    for cls in type(env).__mro__:
+        yield {cls.__name__: cls}, cls.__name__
     for function in functions_of(env):
+        yield {function.__name__: function}, function.__name__
         own = (function.__module__ or "").partition(".")[0]
         for place, name in places_of(function):
             known = id(place), name
@@ -161,9 +173,9 @@ def _places_outside(env: FMUEnv) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _is_followed(value: Any, own: str) -> bool:
-    if isinstance(value, (ModuleType, type, FunctionType, gymnasium.Env)):
+    if isinstance(value, (ModuleType, gymnasium.Env)):
         return False
-    is_known = isinstance(value, (*_KINDS, bool, int, float, np.generic))
+    is_known = isinstance(value, (*_KINDS, type, bool, int, float, np.generic))
     return is_known or type(value).__module__.partition(".")[0] == own
 
 
@@ -250,8 +262,35 @@ def _restore_attributes(target: Any, contents: Mapping[str, Any]) -> None:
         object.__setattr__(target, name, value)
 
 
-def _parts_of_function(function: Any) -> list[Any]:
-    return [*(function.__closure__ or ()), *(function.__defaults__ or ()), function.__kwdefaults__]
+def _held_by_function(function: Any) -> tuple[Any, ...]:
+    kept = function.__closure__ or (), function.__defaults__ or (), function.__kwdefaults__ or {}
+    return *kept, dict(vars(function))
+
+
+def _parts_of_function(contents: tuple[Any, ...]) -> list[Any]:
+    closure, defaults, of_keywords, attributes = contents
+    return [*closure, *defaults, of_keywords, *attributes.values()]
+
+
+def _restore_function(function: Any, contents: tuple[Any, ...]) -> None:
+    _restore_dict(vars(function), contents[-1])
+
+
+def _data_of_class(cls: Any) -> dict[str, Any]:
+    """The attributes of a class that are no code."""
+    return {
+        name: value
+        for name, value in vars(cls).items()
+        if not name.startswith("__") and not callable(value) and not hasattr(value, "__get__")
+    }
+
+
+def _restore_class(cls: Any, contents: Mapping[str, Any]) -> None:
+    for name in _data_of_class(cls).keys() - contents.keys():
+        type.__delattr__(cls, name)
+    for name, value in contents.items():
+        if vars(cls).get(name) is not value:
+            type.__setattr__(cls, name, value)
 
 
 def _nothing(_: Any) -> tuple[()]:
@@ -272,26 +311,38 @@ _KINDS: Final[Mapping[type, _Kind]] = {
     np.random.BitGenerator: _Kind(
         _nothing, lambda bits: bits.state, lambda bits, state: setattr(bits, "state", state)
     ),
+    SimpleNamespace: _Kind(dict.values, _attributes_of, _restore_attributes),
     random.Random: _Kind(_nothing, random.Random.getstate, random.Random.setstate),
     CellType: _Kind(
         iter,
         lambda cell: [cell.cell_contents],
         lambda cell, contents: setattr(cell, "cell_contents", contents[0]),
     ),
-    FunctionType: _Kind(_parts_of_function),
+    FunctionType: _Kind(_parts_of_function, _held_by_function, _restore_function),
+    BuiltinMethodType: _Kind(lambda method: [method.__self__]),
     MethodType: _Kind(lambda method: [method.__self__]),
     partial: _Kind(lambda made: [made.func, made.args, made.keywords]),
 }
+_CLASS: Final = _Kind(dict.values, _data_of_class, _restore_class)
 _INSTANCE: Final = _Kind(dict.values, _attributes_of, _restore_attributes)
 _PLAIN: Final = (
     *(bool, int, float, complex, str, bytes, type(None), np.generic),
-    *(type, ModuleType, PurePath),
+    *(ModuleType, PurePath),
 )
+
+
+def _is_of_a_package(cls: type) -> bool:
+    """Whether a class is Python's, numpy's or ours."""
+    package = cls.__module__.partition(".")[0]
+    is_ours = package in OURS and not cls.__module__.startswith("fmugym.envs")
+    return is_ours or package == "numpy" or package in sys.stdlib_module_names - {"__main__"}
 
 
 def _kind_of(value: Any) -> _Kind | None:
     """How to keep the contents of an object; None if it has none that hooks could change."""
     cls = type(value)
+    if isinstance(value, type):
+        return None if _is_of_a_package(value) else _CLASS
     if issubclass(cls, _PLAIN):
         return None
     if cls.__module__.partition(".")[0] in OURS or issubclass(cls, (gymnasium.Env, spaces.Space)):

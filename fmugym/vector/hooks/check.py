@@ -22,6 +22,7 @@ from fmugym.task.step import ORDER
 from fmugym.task.values import ParameterValues
 from fmugym.vector.action_arrays import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
+from fmugym.vector.hooks.purity import unrepeatable
 from fmugym.vector.views import batched, column, some
 
 __all__ = ["CURE", "find_difference", "sample_of", "sample_states", "states_around"]
@@ -104,7 +105,7 @@ def _obstacle(env: FMUEnv) -> str | None:
         return f"actions of {env.action_space} do not make one array"
     if not _makes_arrays(env.observation_space):
         return f"observations of {env.observation_space} do not make arrays"
-    return None
+    return unrepeatable(env)
 
 
 def _makes_arrays(space: spaces.Space[Any]) -> bool:
@@ -272,7 +273,7 @@ class _Comparison(NamedTuple):
         if any(changes):
             self.contents.restore()
         attribute = changes.inside
-        if changes.outside is not None:
+        if attribute is None and changes.outside is not None:
             attribute = f"{_OUTSIDE}{changes.outside}"
         return result, changed[0] if changed else attribute
 

@@ -12,9 +12,9 @@ import numpy as np
 from fmugym.env import FMUEnv
 from fmugym.vector.contents import OURS
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.tables import functions_of, names_in, places_of
+from fmugym.vector.hooks.tables import defaults_of, functions_of, names_in, places_of
 
-__all__ = ["names_in_hooks", "require_pure"]
+__all__ = ["names_in_hooks", "require_pure", "unrepeatable"]
 
 _LEAVES: Final = (bool, int, float, complex, str, bytes, type(None), range, np.generic)
 
@@ -47,6 +47,31 @@ def _is_plain(value: Any) -> bool:
     return type(value) in (list, tuple, set, frozenset) and all(map(_is_plain, value))
 
 
+def unrepeatable(env: FMUEnv) -> str | None:
+    """What hooks refer to that a call may change for good, in words; None if there is nothing.
+
+    Python keeps default arguments for all calls and all environments. So hooks with some that can
+    change are not called more often than a task asks for.
+    """
+    for function in functions_of(env):
+        for name, value in defaults_of(function).items():
+            if not _is_fixed(value):
+                what = f"{name}, a {type(value).__name__} that it could change"
+                return f"{function.__name__} has a default argument {what}"
+    return None
+
+
+def _is_fixed(value: Any) -> bool:
+    """Whether no call can change a value, and functions are looked at by themselves."""
+    if isinstance(value, tuple | frozenset):
+        return all(map(_is_fixed, value))
+    if isinstance(value, (*_LEAVES, FunctionType, ModuleType, type, np.dtype, np.ufunc)):
+        return True
+    if isinstance(value, BuiltinFunctionType):
+        return value.__self__ is None or isinstance(value.__self__, ModuleType)
+    return callable(value) and (getattr(value, "__module__", None) or "").startswith("numpy")
+
+
 def require_pure(env: FMUEnv) -> None:
     """Refuse hooks that refer to what acts on something, or to objects that they could change.
 
@@ -56,6 +81,9 @@ def require_pure(env: FMUEnv) -> None:
     Raises:
         UntraceableError: With the name.
     """
+    obstacle = unrepeatable(env)
+    if obstacle is not None:
+        raise UntraceableError(obstacle)
     for function in functions_of(env):
         names = set(names_in(function.__code__))
         if not _ACTING.isdisjoint(names):

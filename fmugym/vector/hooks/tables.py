@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dis import get_instructions
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, Final
 
@@ -27,6 +29,7 @@ from fmugym.vector.hooks.symbols import (
 __all__ = [
     "FUNCTIONS",
     "Table",
+    "defaults_of",
     "functions_of",
     "is_foreign",
     "is_table",
@@ -224,6 +227,9 @@ class _Variable(dict[str, Any]):
         super().__init__({"": cell.cell_contents})
         self._cell = cell
 
+    def __getitem__(self, name: str) -> Any:
+        return self._cell.cell_contents
+
     def __setitem__(self, name: str, value: Any) -> None:
         self._cell.cell_contents = value
 
@@ -273,6 +279,7 @@ def places_of(function: FunctionType) -> list[tuple[dict[str, Any], str]]:
     names = set(names_in(function.__code__))
     spaces = [function.__globals__]
     modules = [function.__globals__.get(name) for name in names]
+    modules += map(sys.modules.get, _imports_in(function.__code__))
     spaces += [
         vars(one) for one in modules if isinstance(one, ModuleType) and not is_foreign(one.__name__)
     ]
@@ -282,7 +289,22 @@ def places_of(function: FunctionType) -> list[tuple[dict[str, Any], str]]:
             places.append((_Variable(cell), ""))
         except ValueError:  # the variable has no value yet
             continue
-    return places
+    return places + [(defaults, name) for defaults in [defaults_of(function)] for name in defaults]
+
+
+def defaults_of(function: FunctionType) -> dict[str, Any]:
+    """The default values of a function's arguments, by the names of these."""
+    defaults, count = function.__defaults__ or (), function.__code__.co_argcount
+    names = function.__code__.co_varnames[count - len(defaults) : count]
+    return dict(zip(names, defaults, strict=True)) | (function.__kwdefaults__ or {})
+
+
+def _imports_in(code: CodeType) -> Iterator[str]:
+    """The names of the modules that some code imports itself."""
+    yield from (one.argval for one in get_instructions(code) if one.opname == "IMPORT_NAME")
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _imports_in(constant)
 
 
 def names_in(code: CodeType) -> Iterator[str]:

@@ -427,8 +427,9 @@ def require_unchanged(contents: Contents) -> None:
     changes = contents.changes()
     if changes.inside is not None:
         raise UntraceableError(f"it changes self.{changes.inside}")
-    if changes.outside is not None:
-        raise UntraceableError(f"it changes {changes.outside}, which all environments share")
+    outside = changes.outside or changes.added
+    if outside is not None:
+        raise UntraceableError(f"it changes {outside}, which all environments share")
 
 
 def _placed(env: FMUEnv, name: str, error: Exception) -> str:
