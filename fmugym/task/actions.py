@@ -70,8 +70,12 @@ def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
     """
     inside, read = env.inside, env.inside.readings
     elements = inside.elements
+    if elements is not None and isinstance(action, bool | np.bool_):
+        action = int(action)  # an element for Gymnasium, but no index for hooks
     if elements is None or type(action) not in _INTEGERS or action not in elements:
         _require_usable(env, action)
+        if inside.quantities is not None and "_get_inputs" in vars(env):
+            action = _of_shape(action, env.action_space)  # the task's own, which reads elements
     before = read.action, read.previous_action, read.previous_state, read.inputs
     read.previous_action, read.previous_state, read.action = read.action, read.state, action
     try:
@@ -94,6 +98,30 @@ def _require_usable(env: Any, action: Any) -> None:
             raise ConfigError(f"action {shown(action)} is not in {env.action_space}")
     elif _has_nan(action):
         raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
+
+
+def _of_shape(action: Any, space: spaces.Space[Any]) -> Any:
+    """The same action in the shape of its space.
+
+    Raises:
+        ConfigError: If it has another number of elements, or does not consist of numbers.
+    """
+    shape = space.shape or ()
+    if type(action) is np.ndarray and action.shape == shape:
+        return action
+    try:
+        array = np.asarray(action)
+        if array.dtype.kind not in "biuf":
+            raise ConfigError(f"action {shown(action)} does not make numbers")
+        if array.shape == shape:
+            return action
+        return array.reshape(shape)
+    except FMUGymError:
+        raise
+    except ordinary(Exception):  # lists of different lengths, or objects whose methods fail
+        raise ConfigError(
+            f"action {shown(action)} is not in {space}: expected numbers of shape {shape}"
+        ) from None
 
 
 def _blame(env: Any, action: Any, error: BaseException) -> ConfigError | None:
