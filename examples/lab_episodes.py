@@ -37,52 +37,46 @@ def run_episode(client: Client, token: str, gain: float, clock: Any) -> float:
     return float(np.mean(heights))
 
 
-def learn(user_token: str, seed: int, clock: Any = time) -> tuple[list[float], str]:
+def learn(user_token: str, seed: int, clock: Any = time) -> list[float]:
     """Search for the best gain.
 
     Args:
-        user_token: Token of a user who may reserve gyms.
+        user_token: Your token.
         seed: Seed of the changes to try.
         clock: Gives the time and sleeps: `time`, or the lab's clock.
 
     Returns:
-        The mean height of each episode, in rods, and the address of the last video.
+        The mean height of each episode, in rods.
     """
     client, rng = Client(), np.random.default_rng(seed)
     gym_token = client.start_gym(user_token, 120, [CellType.SINGLE])
-    gain, best, heights, video = 0.001, -np.inf, [], ""
+    gain, best, heights = 0.001, -np.inf, []
     for episode in range(EPISODES):
         candidate = gain * np.exp(0.5 * rng.standard_normal()) if episode else gain
-        last = episode == EPISODES - 1
-        token, _ = client.start_episode(gym_token, "SimplePendulum", EPISODE_TIME, record=last)
+        token, _ = client.start_episode(gym_token, "SimplePendulum", EPISODE_TIME)
         try:
             heights.append(run_episode(client, token, candidate, clock))
         except RuntimeError as error:  # it went over the top, and the lab ended the episode
             print(str(error).partition(";")[0])
             heights.append(0.0)
-        video = client.stop_episode(token)
+        client.stop_episode(token)
         if heights[-1] > best:
             gain, best = candidate, heights[-1]
         print(f"episode {episode}: gain {1e3 * candidate:.2f} mN m s/rad, {heights[-1]:.3f} rods")
     client.stop_gym(gym_token)
-    return heights, video
+    return heights
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Learn, and print the result."""
     parser = argparse.ArgumentParser(description="Learn to swing the lab's pendulum up.")
-    parser.add_argument("--preset", choices=("hardware", "ideal"), default="hardware")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fast", action="store_true", help="do not wait for real time")
-    parser.add_argument("--videos", help="folder for the video of the last episode")
     options = parser.parse_args(arguments)
     clock = ManualClock() if options.fast else None
-    folder = options.videos
-    with Lab(options.preset, clock=clock, seed=options.seed, video_folder=folder):
-        heights, video = learn("my token", options.seed, clock or time)
+    with Lab(clock=clock, seed=options.seed):
+        heights = learn("my token", options.seed, clock or time)
     print(f"mean height {heights[0]:.3f} rods at first, {max(heights):.3f} at best")
-    if folder:
-        print(f"the last episode: {video}")
 
 
 if __name__ == "__main__":

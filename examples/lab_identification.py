@@ -51,7 +51,7 @@ def collect(user_token: str, angles: Sequence[float], clock: Any = time) -> list
     """Reserve the cells and record a swing from each angle, with one thread per cell.
 
     Args:
-        user_token: Token of a user who may reserve gyms.
+        user_token: Your token.
         angles: The start angles [rad].
         clock: Gives the time and sleeps: `time`, or the lab's clock.
     """
@@ -86,13 +86,12 @@ def fit(swings: Sequence[Swing], with_coulomb: bool = False) -> NDArray[np.float
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the experiment and print the results."""
     parser = argparse.ArgumentParser(description="Measure the length of the lab's pendulum.")
-    parser.add_argument("--preset", choices=("hardware", "ideal"), default="hardware")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--fast", action="store_true", help="do not wait for real time")
     options = parser.parse_args(arguments)
     angles = np.random.default_rng(options.seed).uniform(-np.pi, np.pi, CELLS * SWINGS)
     clock = ManualClock() if options.fast else None
-    with Lab(options.preset, clock=clock, seed=options.seed):
+    with Lab(clock=clock, seed=options.seed):
         swings = collect("my token", angles, clock or time)
     p1, p2 = fit(swings)
     print(f"{len(swings)} swings: p1 = {p1:.3f} 1/s, length = {100 * GRAVITY / p2:.2f} cm")

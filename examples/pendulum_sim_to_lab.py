@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 import fmugym
-from fmugym.lab import CellType, Lab, ManualClock
+from fmugym.lab import CellType, Client, Lab, ManualClock
 from fmugym.linearization import LinearModel, linearize
 
 ENV = "fmugym/CloudPendulum-v0"
@@ -132,11 +132,11 @@ def play_on_lab(
         seed: Seed of the lab's friction, noise and delays, and of the start.
         fast: Whether to advance the lab's clock instead of waiting.
         plant: Parameters of the cell's FMU.
-        options: Options of the lab that replace those of the preset `hardware`.
+        options: Options of the lab.
     """
     clock, parameters = ManualClock() if fast else None, {CellType.SINGLE: plant or {}}
-    with Lab("hardware", clock=clock, seed=seed, parameters=parameters, **options) as lab:
-        return play(gymnasium.make(ENV, backend=lab), model, seed)
+    with Lab(clock=clock, seed=seed, parameters=parameters, **options):
+        return play(gymnasium.make(ENV, backend=Client()), model, seed)
 
 
 def worst_angles(q: Array) -> Array:

@@ -179,7 +179,6 @@ SLOW_TESTS = (
     "test_hostile_archive.py::TestMemory",
     "test_identification.py::TestOutputError",
     "test_identification.py::test_example",
-    "test_lab_recording.py::test_temporary_videos",
     "test_lab_sessions.py::TestNothingLeaks",
     "test_licences.py::TestInitializations::test_of_a_vector_environment",
     "test_licences.py::TestInitializations::test_trials_keep",

@@ -18,7 +18,6 @@ from fmugym.errors import ConfigError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool import Paced
 from fmugym.pool.backend.clocks import RealClock
-from fmugym.signals import ordinary
 
 __all__ = ["Cell", "Lease", "paced_cells"]
 
@@ -54,7 +53,7 @@ def paced_cells(
     """Make cells that are stepped in the lab's time.
 
     Args:
-        client: A client, or a lab whose method ``client`` returns one.
+        client: A client of a lab.
         user_token: For experiments, or for a new lease.
         gym_token: The token of an existing lease.
         gym_time: Length of a new lease, in s.
@@ -63,8 +62,6 @@ def paced_cells(
     Raises:
         ConfigError: If that is no client, or the tokens or times do not fit.
     """
-    if not _is_client(client) and has_method(client, "client"):
-        client = client.client()
     if not _is_client(client):
         raise ConfigError(
             "backend must be 'fmu', or a client of the lab such as fmugym.lab.Client(), "
@@ -174,7 +171,7 @@ class Cell:
         try:
             outputs = self._read(token)
             self._client.set_torque(inputs["tau"], token)
-        except ordinary(RuntimeError) as error:
+        except RuntimeError as error:
             if _LEAVING.search(str(error)) is None:
                 raise
             return self._outputs, Status.TERMINATED
@@ -204,12 +201,12 @@ class Cell:
         (token, is_leased), self._session = self._session, None
         try:
             self._client.set_torque(0.0, token)
-        except ordinary(Exception) as error:  # whatever it is, the session is to be stopped
+        except Exception as error:  # whatever it is, the session is to be stopped
             logger.debug("the torque was not taken away: %s", error)
         stop = self._client.stop_episode if is_leased else self._client.stop_experiment
         try:
             stop(token)
-        except ordinary(RuntimeError) as error:
+        except RuntimeError as error:
             logger.debug("the session was not stopped: %s", error)
 
 
@@ -226,7 +223,7 @@ def _simulated_lab(client: Any) -> Any:
 def _like(client: Any) -> Any:
     """Make a client of the same lab, because each thread needs its own."""
     lab = _simulated_lab(client)
-    return type(client)() if lab is None else lab.client()
+    return type(client)() if lab is None else type(client)(lab)
 
 
 def _cell_type(client: Any) -> Any:

@@ -94,8 +94,8 @@ class CloudPendulumEnv(FMUEnv):
 
     ## Arguments
     * ``torque_limit``: the torque of an action of 1, at most 0.15 N m.
-    * ``backend``: "fmu", a client (``fmugym.lab.Client()`` or the real
-      ``cloudpendulumclient.client.Client()``), or a ``fmugym.lab.Lab``.
+    * ``backend``: "fmu", or a client: ``fmugym.lab.Client()`` or the real
+      ``cloudpendulumclient.client.Client()``.
     * ``model_parameters``: values or distributions for the FMU's parameters, such as ``l``, ``b``
       and ``c``. In the lab only ``q_0``, the start angle, can be given.
     * ``user_token``: the lab's user token, which the simulated lab does not need. Each episode is

@@ -11,21 +11,17 @@ To run a program for the real lab here, change its import::
     print(client.get_position(token))
     client.stop_gym(gym_token)
 
-`Lab` creates labs with other properties: ``Lab("ideal")`` has cells without friction, noise and
-delay, and ``Lab(clock=ManualClock())`` has a clock that the program moves.
+`Lab` creates labs with other properties: ``Lab(torque_noise=0.0)`` has cells that read torques
+without noise, and ``Lab(clock=ManualClock())`` has a clock that the program moves.
 """
 
-from fmugym.lab.client import Client, Lab, current_lab
-from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, LabError, UserInfo
-from fmugym.lab.presets import HARDWARE, IDEAL, Options
-from fmugym.lab.users import User
+from fmugym.lab.client import Client
+from fmugym.lab.data import CellType, LabError, UserInfo
+from fmugym.lab.lab import Lab, current_lab
+from fmugym.lab.lab_options import Options
 from fmugym.pool.backend.clocks import Clock, ManualClock, RealClock
 
 __all__ = [
-    "HARDWARE",
-    "IDEAL",
-    "ActuatorInfo",
-    "CellInfo",
     "CellType",
     "Client",
     "Clock",
@@ -34,7 +30,6 @@ __all__ = [
     "ManualClock",
     "Options",
     "RealClock",
-    "User",
     "UserInfo",
     "current_lab",
 ]

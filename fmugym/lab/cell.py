@@ -15,17 +15,14 @@ from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import checked_value
 from fmugym.checks import check_mapping
-from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.lab.data import CellType, LabError
-from fmugym.lab.disturbance import Acting, Disturbance
 from fmugym.lab.drive import HOLD_DAMPING, Drive
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
-from fmugym.lab.presets import Options
+from fmugym.lab.lab_options import Options
 from fmugym.lab.sensors import Sensors
-from fmugym.lab.videos import Recording
 from fmugym.pool import Pool, PoolSpec
-from fmugym.signals import ordinary
 from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
@@ -89,24 +86,14 @@ class Cell:
         self.torque = [0.0] * joints
         self.drive = Drive(self.options, [True] * joints)
         self.fault: str | None = None
-        self.recording: Recording | None = None
         self._steps = 0
-        self._disturbances: list[Acting] = []
 
-    def start(
-        self,
-        experiment: str,
-        position: Sequence[float],
-        disturbances: Sequence[Disturbance],
-        recording: Recording | None,
-    ) -> None:
+    def start(self, experiment: str, position: Sequence[float]) -> None:
         """Bring the arm to its start position and release it.
 
         Args:
             experiment: The type of experiment.
             position: The requested angles, in rad.
-            disturbances: The disturbances of the session.
-            recording: Collects the angles and torques.
 
         Raises:
             SimulationError: If the FMU refuses its parameters.
@@ -119,10 +106,7 @@ class Cell:
                 self._hold(position)
         self.velocity = [0.0] * self.plant.joints
         self.drive = Drive(self.options, spec.driven)
-        self._disturbances = [Acting(each) for each in disturbances]
-        self.recording = recording
         self.sensors.restart(self.position)
-        self._record()
 
     def advance(self, elapsed: float) -> None:
         """Simulate the arm, in whole steps of the drive.
@@ -184,20 +168,11 @@ class Cell:
                 break
 
     def _step(self) -> None:
-        torque = self.torque = self.drive.evaluate(self.position, self.velocity)
-        self._push(self._disturbed(torque) if self._disturbances else torque)
+        self.torque = self.drive.evaluate(self.position, self.velocity)
+        self._push(self.torque)
         self._steps += 1
         self.sensors.observe(self.position, self.velocity, self.torque)
-        self._record()
         self._check_limits()
-
-    def _disturbed(self, torque: list[float]) -> list[float]:
-        for each in self._disturbances:
-            try:
-                torque = each.apply(self.time, self.position, self.velocity, torque)
-            except ordinary(Exception) as error:  # a disturbance may be the user's own class
-                self.fault = f"a disturbance failed: {shown(error)}"
-        return torque
 
     def _push(self, torque: Sequence[float]) -> None:
         pool = self._open()
@@ -210,16 +185,11 @@ class Cell:
         state: list[float] = pool.outputs[:, 0].tolist()
         self.position, self.velocity = state[: self.plant.joints], state[self.plant.joints :]
 
-    def _record(self) -> None:
-        if self.recording is not None:
-            self.recording.observe(self.time, self.position, self.torque)
-
     def _check_limits(self) -> None:
         options = self.options
         for kind, values, limit in (
             ("Position", self.position, options.position_limit),
             ("Velocity", self.velocity, options.velocity_limit),
-            ("Torque", self.torque, options.torque_limit),
         ):
             for joint, value in enumerate(values):
                 if abs(value) > limit and self.fault is None:

@@ -1,4 +1,4 @@
-"""What the client's methods give: data, and the error that they raise."""
+"""Data of the client's methods, and the error that they raise."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import enum
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
 
 from fmugym.errors import FMUGymError
 
-__all__ = ["ActuatorInfo", "CellInfo", "CellType", "LabError", "UserInfo", "as_lab_error"]
+__all__ = ["CellType", "LabError", "UserInfo", "as_lab_error"]
 
 
 class CellType(enum.Enum):
@@ -23,71 +22,25 @@ class CellType(enum.Enum):
 
 
 @dataclass(frozen=True)
-class CellInfo:
-    """A cell of the lab.
-
-    Attributes:
-        cell_id: The cell's number, for ``start_experiment(cell_id=...)``.
-        cell_type: The cell's type.
-    """
-
-    cell_id: int
-    cell_type: CellType
-
-
-@dataclass(frozen=True)
 class UserInfo:
-    """A user's rights, and how much of them is left.
+    """A user's rights, as the real lab tells them.
+
+    The simulated lab keeps the two limits of time. It counts no attempts, so the other numbers
+    never change. All numbers are nominal: those of the real lab are not public.
 
     Attributes:
-        user_name: The user's name.
         number_of_attempts: How many more experiments the user may start.
         max_experiment_length: Longest experiment or episode, in s.
-        bucket_size: How many experiments the user may start right now.
-        max_bucket_size: The largest value of ``bucket_size``.
-        refil_interval: Time after which ``bucket_size`` grows by one, in s. The lab spells it
-            this way.
-        valid_from: When the user token becomes valid.
-        valid_until: When the user token expires.
-        experiment_types: The types of experiments the user may start.
-        max_gym_length: Longest lease of a gym, in s; 0 without gym permission.
-        gym_bucket_size: How many gyms the user may start right now.
+        max_gym_length: Longest lease of cells, in s.
+        gym_bucket_size: How many leases the user may start right now.
         gym_max_bucket_size: The largest value of ``gym_bucket_size``.
     """
 
-    user_name: str
-    number_of_attempts: int
-    max_experiment_length: float
-    bucket_size: int
-    max_bucket_size: int
-    refil_interval: float
-    valid_from: datetime
-    valid_until: datetime
-    experiment_types: tuple[str, ...]
-    max_gym_length: float
-    gym_bucket_size: int
-    gym_max_bucket_size: int
-
-
-@dataclass(frozen=True)
-class ActuatorInfo:
-    """An actuator of a cell.
-
-    Attributes:
-        name: The joint that it drives.
-        motor: The motor of the real cell.
-        drive: The drive of the real cell.
-        torque_limit: Largest torque, in N m; 0 for a joint that is passive in the experiment.
-        velocity_limit: Angular velocity at which the session ends, in rad/s.
-        position_limit: Angle from hanging at which the session ends, in rad.
-    """
-
-    name: str
-    motor: str
-    drive: str
-    torque_limit: float
-    velocity_limit: float
-    position_limit: float
+    number_of_attempts: int = 1000
+    max_experiment_length: float = 60.0
+    max_gym_length: float = 3600.0
+    gym_bucket_size: int = 20
+    gym_max_bucket_size: int = 20
 
 
 class LabError(FMUGymError, RuntimeError):
@@ -95,10 +48,9 @@ class LabError(FMUGymError, RuntimeError):
 
     Programs for the real lab expect a `RuntimeError`, and look for these texts:
 
-    * ``Velocity Limit Violation`` and ``VelocityLimitViolation;value=...``, and the same for
-      position and torque: the cell was brought to rest and the session ended.
+    * ``Velocity Limit Violation`` and ``VelocityLimitViolation;value=...``, and the same for the
+      position: the cell was brought to rest and the session ended.
     * ``outside the limits``: an argument is out of its range.
-    * ``Too many requests ... try again in N seconds``: too many starts, or an empty bucket.
     """
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from fmugym.lab.presets import Options
+from fmugym.lab.lab_options import Options
 
 __all__ = ["HOLD_DAMPING", "Drive"]
 
 HOLD_DAMPING: Final = 0.03
-"""Damping of the controllers that hold or pull an arm, in N m s/rad; about critical for the single
+"""Damping of the controller that holds an arm, in N m s/rad; about critical for the single
 pendulum."""
 
 
@@ -38,8 +38,7 @@ class Drive:
         zeros = [0.0] * len(driven)
         self.position, self.velocity, self.torque = zeros[:], zeros[:], zeros[:]
         self.kp, self.kd = zeros[:], zeros[:]
-        largest = options.torque_limit if options.saturate_torque else options.peak_torque
-        self._limits = [largest if is_driven else 0.0 for is_driven in driven]
+        self._limits = [options.torque_limit if is_driven else 0.0 for is_driven in driven]
         self._ahead = 0.5 * options.drive_step
 
     def evaluate(self, position: Sequence[float], velocity: Sequence[float]) -> list[float]:

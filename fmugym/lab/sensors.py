@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fmugym.lab.presets import Options
+from fmugym.lab.lab_options import Options
 
 __all__ = ["Sensors"]
 

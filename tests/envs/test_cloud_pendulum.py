@@ -10,12 +10,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from lab_tools import ideal_lab
 from process_tools import INTERRUPTIBLE
 from scipy.integrate import solve_ivp
 
 from fmugym import ConfigError, SimulationError, Uniform
 from fmugym.envs import CloudPendulumEnv
-from fmugym.lab import CellType, Client, Lab, ManualClock, User
+from fmugym.lab import CellType, Client, Lab, ManualClock
 
 ID = "fmugym/CloudPendulum-v0"
 M, L, B, G = 0.06, 0.1, 4e-4, 9.81  # kg, m, N m s/rad, m/s^2: the published nominal values
@@ -26,8 +27,8 @@ def fixture_make_lab(opened):
     """Make labs on a clock that stands still; in the end, nothing runs on them."""
     labs = []
 
-    def make(preset="ideal", **options):
-        labs.append(opened(Lab(preset, clock=ManualClock(), seed=0, **options)))
+    def make(make_lab=ideal_lab, **options):
+        labs.append(opened(make_lab(clock=ManualClock(), seed=0, **options)))
         return labs[-1]
 
     yield make
@@ -167,7 +168,7 @@ class TestOnTheLab:
     def test_the_same_as_on_the_fmu(self, make_lab):
         """Solver steps of 2 ms there and 0.5 ms here: 1e-6 of 10 s of swings that are not small."""
         actions = swings(500)
-        on_fmu, on_lab = gym.make(ID), gym.make(ID, backend=make_lab())
+        on_fmu, on_lab = gym.make(ID), gym.make(ID, backend=Client(make_lab()))
         states, rewards = run(on_fmu, actions, seed=3)
         lab_states, lab_rewards = run(on_lab, actions, seed=3)
         assert np.ptp(states[:, 0]) > 1.0
@@ -185,31 +186,18 @@ class TestOnTheLab:
         assert lab.running == ["experiment"]
         assert (info["sample_age"], info["deadline_misses"]) == (0.0, 0)
 
-    def test_tokens_of_users(self, make_lab):
-        lab = make_lab(users={"ada": User(), "bob": User(gym=False)})
-        with pytest.raises(SimulationError, match="unknown user token"):
-            gym.make(ID, backend=lab).reset()
-        env = gym.make(ID, backend=lab, user_token="bob")
-        env.reset()
-        env.close()
-        with pytest.raises(SimulationError, match="has no gym permission"):
-            gym.make(ID, backend=lab, user_token="bob", gym_time=60).reset()
-        assert lab.running == []
-
     def test_a_lease_of_ones_own_serves_all_episodes(self, make_lab, on_lab):
         lab = make_lab()
-        env = on_lab(lab, user_token="ada", gym_time=100.0)
+        env = on_lab(Client(lab), user_token="ada", gym_time=100.0)
         for _ in range(3):
             env.reset()
             env.step(np.zeros(1, np.float32))
             assert lab.running == ["episode", "gym"]
-        assert Client(lab).get_user_info("ada").gym_bucket_size == 19
-        assert Client(lab).get_user_info("ada").number_of_attempts == 1000
 
     def test_a_lease_that_is_there_is_used_and_left(self, make_lab):
         lab = make_lab()
         token = Client(lab).start_gym("ada", 100.0, [CellType.SINGLE])
-        env = gym.make(ID, backend=lab, gym_token=token)
+        env = gym.make(ID, backend=Client(lab), gym_token=token)
         env.reset()
         assert lab.running == ["episode", "gym"]
         env.close()
@@ -220,8 +208,8 @@ class TestOnTheLab:
     def test_what_the_lab_cannot_set_is_refused(self, make_lab, names):
         lab = make_lab()
         with pytest.raises(ConfigError, match="cannot be set in the lab"):
-            CloudPendulumEnv(backend=lab, model_parameters=names)
-        env = CloudPendulumEnv(backend=lab, model_parameters={"q_0": 0.2})
+            CloudPendulumEnv(backend=Client(lab), model_parameters=names)
+        env = CloudPendulumEnv(backend=Client(lab), model_parameters={"q_0": 0.2})
         assert env.reset()[1]["drawn"] == {}
         assert env.state == pytest.approx((0.2, 0.0))
         with pytest.raises(ConfigError, match="cannot be set in the lab"):
@@ -240,11 +228,11 @@ class TestOnTheLab:
     )
     def test_arguments_that_do_not_fit(self, make_lab, arguments, text):
         with pytest.raises(ConfigError, match=text):
-            CloudPendulumEnv(**{"backend": make_lab(), **arguments})
+            CloudPendulumEnv(**{"backend": Client(make_lab()), **arguments})
 
     def test_a_limit_ends_it_as_on_the_fmu(self, make_lab):
         ends = []
-        for backend in ("fmu", make_lab()):
+        for backend in ("fmu", Client(make_lab())):
             env = CloudPendulumEnv(backend=backend)
             env.reset(seed=0)
             terminated = False
@@ -256,9 +244,9 @@ class TestOnTheLab:
             env.close()
         assert abs(ends[0] - ends[1]) <= 1
 
-    def test_the_hardware_preset(self, make_lab, on_lab):
-        lab = make_lab("hardware")
-        env = on_lab(lab)
+    def test_a_lab_as_it_is(self, make_lab, on_lab):
+        lab = make_lab(Lab)
+        env = on_lab(Client(lab))
         env.reset(seed=0)
         ages = []
         for action in swings(200):
@@ -295,10 +283,10 @@ class TestOnTheLab:
 
     def test_without_a_keeper_the_session_is_lost(self, make_lab, on_lab):
         lab = make_lab()
-        env = on_lab(lab)
+        env = on_lab(Client(lab))
         env.reset()
         lab.clock.advance(2.5)
-        lab._bookings.settle(lab.clock.time())
+        lab._settle(lab.clock.time())
         observation, _, terminated, truncated, info = env.step(np.zeros(1, np.float32))
         assert (terminated, truncated) == (False, True)
         assert "no request for 2 s" in info["fault"]
@@ -308,7 +296,7 @@ class TestOnTheLab:
 
     def test_an_expired_lease(self, make_lab, on_lab):
         lab = make_lab()
-        env = on_lab(lab, gym_time=3.0)
+        env = on_lab(Client(lab), gym_time=3.0)
         env.reset()
         assert "the lease of its gym is over" in last(env, swings(160))["fault"]
         with pytest.raises(SimulationError, match="the gym has ended"):
@@ -318,7 +306,7 @@ class TestOnTheLab:
 
     def test_the_session_time(self, make_lab, on_lab):
         lab = make_lab()
-        env = on_lab(lab, session_time=1.0)
+        env = on_lab(Client(lab), session_time=1.0)
         env.reset()
         assert "its time of 1 s is over" in last(env, swings(56))["fault"]
 
@@ -338,13 +326,12 @@ class TestCells:
             for left, right in zip(got[:4], expected[:4], strict=True):
                 np.testing.assert_allclose(left, right, atol=1e-5)
         assert got[4]["_sample_age"].all()
-        assert Client(lab).get_user_info("fmugym").gym_bucket_size == 19
         alone.close()
 
-    def test_cells_of_the_hardware_preset_start_together(self, make_lab, on_lab):
+    def test_cells_start_together(self, make_lab, on_lab):
         """Homing takes a second: for all of them at once, also where a clock is moved by hand."""
-        lab = make_lab("hardware", stall_share=0.0)
-        env = on_lab(lab, num_envs=4)
+        lab = make_lab(Lab, stall_share=0.0)
+        env = on_lab(Client(lab), num_envs=4)
         env.reset(seed=0)
         assert lab.clock.time() == pytest.approx(1.0, abs=0.05)
         for _ in range(50):
@@ -354,7 +341,7 @@ class TestCells:
 
     def test_programs_of_several_threads(self, make_lab):
         """Two programs, each with a lease of its own; time waits for both."""
-        lab, ends = make_lab("hardware", stall_share=0.0), []
+        lab, ends = make_lab(Lab, stall_share=0.0), []
 
         def program():
             env, begin = gym.make(ID, backend=Client(lab), gym_time=60.0), lab.clock.time()
@@ -376,7 +363,7 @@ class TestCells:
         assert lab.running == []
 
     def test_more_cells_than_there_are(self, make_lab, on_lab):
-        env = on_lab(make_lab(), num_envs=5)
+        env = on_lab(Client(make_lab()), num_envs=5)
         with pytest.raises(SimulationError, match="the lab has 4 cells of type SINGLE, not 5"):
             env.reset()
 
@@ -385,11 +372,12 @@ class TestCells:
         start_episode = lab.start_episode
 
         def started(*args):
-            tokens.append(start_episode(*args))
-            return tokens[-1]
+            token, address = start_episode(*args)
+            tokens.append(token)
+            return token, address
 
         monkeypatch.setattr(lab, "start_episode", started)
-        env = on_lab(lab, num_envs=3, autoreset_mode="same_step")
+        env = on_lab(Client(lab), num_envs=3, autoreset_mode="same_step")
         env.reset()
         zeros = np.zeros((3, 1), np.float32)
         Client(lab).stop_episode(tokens[1])
@@ -408,7 +396,7 @@ PROGRAM = """
 import sys
 import gymnasium as gym, numpy as np
 import fmugym
-from fmugym.lab import Lab
+from fmugym.lab import Client, Lab
 
 stop_session = Lab.stop_session
 def told(self, *args):
@@ -417,8 +405,7 @@ def told(self, *args):
     return result
 Lab.stop_session = told
 
-lab = Lab("ideal")
-env = gym.make("fmugym/CloudPendulum-v0", backend=lab)
+env = gym.make("fmugym/CloudPendulum-v0", backend=Client(Lab(homing_time=0.0)))
 env.reset()
 print("running", flush=True)
 for _ in range(int(sys.argv[1])):

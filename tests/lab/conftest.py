@@ -1,14 +1,12 @@
-"""What the tests of the lab share."""
+"""Fixtures of the lab's tests."""
 
 import pytest
-from lab_tools import experiment
-
-from fmugym.lab import Lab, ManualClock
+from lab_tools import experiment, ideal_lab
 
 
 @pytest.fixture
 def lab():
-    with Lab("ideal", clock=ManualClock(), seed=0) as made:
+    with ideal_lab() as made:
         yield made
 
 

@@ -1,24 +1,23 @@
-"""The cells: their motion, their drives, and what the presets make of the readings."""
+"""The cells: their motion, their drives, and their readings."""
 
 import math
 
 import numpy as np
 import pytest
-from lab_tools import experiment, track
+from lab_tools import AT_ONCE, experiment, ideal_lab, track
 from scipy.integrate import solve_ivp
 
 from fmugym import ConfigError
-from fmugym.lab import HARDWARE, CellType, Lab, LabError, ManualClock
+from fmugym.lab import CellType, Lab, LabError, ManualClock, Options
 
 WEIGHT = 0.06 * 9.81 * 0.1  # N m
 INERTIA = 0.06 * 0.1**2  # kg m^2
 ENCODER_STEP = 2 * math.pi / 2**17  # rad
 LAG = 0.00375  # s
-AT_ONCE = {"get_time": (0.0, 0.0), "set_time": (0.0, 0.0)}
 
 
-def make_lab(preset="ideal", **arguments):
-    return Lab(preset, clock=ManualClock(), seed=7, **arguments)
+def make_lab(**arguments):
+    return Lab(**{"clock": ManualClock(), "seed": 7, **arguments})
 
 
 def free_fall(angle, times, friction=0.0):
@@ -55,17 +54,17 @@ class TestMotion:
         assert client.get_position(token) == pytest.approx(1.0, abs=1e-12)
 
     def test_a_session_begins_anew(self, lab):
-        client, token = experiment(lab, cell_id=101)
+        client, token = experiment(lab)
         client.set_impedance_controller_params(1.0, 0.01, token)
         client.set_torque(0.1, token)
         lab.clock.advance(0.2)
         client.stop_experiment(token)
-        client, token = experiment(lab, cell_id=101)
+        client, token = experiment(lab)
         lab.clock.advance(0.5)
         assert (client.get_position(token), client.get_velocity(token)) == pytest.approx((0, 0))
 
     def test_parameters_of_the_plant(self):
-        with make_lab(parameters={CellType.SINGLE: {"b": 0.0, "l": 0.4}}) as lab:
+        with ideal_lab(parameters={CellType.SINGLE: {"b": 0.0, "l": 0.4}}) as lab:
             client, token = experiment(lab, initial_position=[0.01])
             swing = track(lab, client, token, 1.5, 0.05)
         times = np.arange(31) * 0.05
@@ -73,12 +72,12 @@ class TestMotion:
 
     def test_unknown_parameter(self):
         with pytest.raises(ConfigError, match="mass"):
-            make_lab(parameters={CellType.SINGLE: {"mass": 1.0}})
+            ideal_lab(parameters={CellType.SINGLE: {"mass": 1.0}})
 
     def test_parameters_that_the_plant_refuses(self):
-        with make_lab(parameters={CellType.SINGLE: {"m": -1.0}}) as lab:
+        with ideal_lab(parameters={CellType.SINGLE: {"m": -1.0}}) as lab:
             with pytest.raises(LabError, match="m, l and v_c must be positive"):
-                experiment(lab, cell_id=101)
+                experiment(lab)
             assert experiment(lab, "Acrobot")
             assert lab.clock.time() == 0.0
 
@@ -108,7 +107,7 @@ class TestDrive:
 
     def test_spring_gains_no_energy(self):
         plant = {CellType.SINGLE: {"b": 0.0}}
-        with make_lab(parameters=plant) as lab:
+        with ideal_lab(parameters=plant) as lab:
             client, token = experiment(lab, "DoubleIntegrator", initial_position=[0.2])
             client.set_impedance_controller_params(0.5, 0.0, token)
             swing = track(lab, client, token, 10.0, 0.001)
@@ -117,7 +116,7 @@ class TestDrive:
     def test_step_of_the_drive_hardly_matters(self):
         swings = []
         for step in (5e-4, 2.5e-5):  # the default, and the 40 kHz of the hardware
-            with make_lab(drive_step=step) as lab:
+            with ideal_lab(drive_step=step) as lab:
                 client, token = experiment(lab)
                 client.set_position(1.0, token)
                 client.set_impedance_controller_params(0.3, 0.003, token)
@@ -132,20 +131,20 @@ class TestStartPosition:
         [(0.6, 0.468), (1.0, 0.787), (1.4, 1.119), (1.9, 1.587), (2.4, 2.133)],
     )
     def test_hardware_sags_as_the_real_double_pendulum_did(self, asked, measured):
-        with make_lab("hardware") as lab:
+        with make_lab() as lab:
             client, token = experiment(lab, "DoublePendulum", initial_position=[asked, 0.0])
             assert client.get_position(token)[0] == pytest.approx(measured, abs=0.012)
 
     @pytest.mark.parametrize("asked", [-2.0, 0.5, 1.0, 2.0])
     def test_single_pendulum_sags_by_its_own_weight(self, asked):
-        with make_lab("hardware", coulomb_friction=(0.0, 0.0)) as lab:
+        with make_lab(coulomb_friction=(0.0, 0.0)) as lab:
             client, token = experiment(lab, initial_position=[asked])
             q = client.get_position(token)
         assert abs(q) < abs(asked)
         assert 0.43 * (asked - q) == pytest.approx(WEIGHT * math.sin(q), abs=1e-4)
 
     def test_homing_takes_its_time(self):
-        with make_lab("hardware", **AT_ONCE) as lab:
+        with make_lab(**AT_ONCE) as lab:
             experiment(lab, preparation_time=0.5)
             assert lab.clock.time() == pytest.approx(1.5)
 
@@ -154,7 +153,7 @@ class TestStartPosition:
 def fixture_readings():
     """Position, velocity and torque of a hardware cell that hangs, one row a new sample."""
     rows = []
-    with make_lab("hardware", **AT_ONCE) as lab:
+    with make_lab(**AT_ONCE) as lab:
         client, token = experiment(lab)
         for _ in range(10_000):
             lab.clock.advance(0.002)
@@ -175,7 +174,7 @@ class TestReadings:
 
     def test_elbow_has_the_worse_sensor(self):
         rows, angles = [], []
-        with make_lab("hardware", **AT_ONCE) as lab:
+        with make_lab(**AT_ONCE) as lab:
             client, token = experiment(lab, "DoublePendulum", initial_position=[1.0, 0.0])
             for _ in range(3000):
                 lab.clock.advance(0.005)
@@ -185,7 +184,7 @@ class TestReadings:
         assert np.allclose(np.remainder(np.divide(angles, 3.835e-4) + 0.5, 1.0), 0.5, atol=0.1)
 
     def test_position_is_quantized(self):
-        with make_lab("hardware") as lab:
+        with make_lab() as lab:
             client, token = experiment(lab, initial_position=[1.5])
             swing = np.array(track(lab, client, token, 2.0))
         assert pytest.approx(4.794e-5, rel=1e-4) == ENCODER_STEP
@@ -194,13 +193,13 @@ class TestReadings:
 
     def test_share_of_stale_repeats_is_the_measured_one(self):
         """In the public swings of 10 s, 44.1 to 44.7 % of the rows at 1 kHz repeat the last."""
-        with make_lab("hardware", **AT_ONCE) as lab:
+        with make_lab(**AT_ONCE) as lab:
             client, token = experiment(lab)
             velocity = track(lab, client, token, 10.0, 0.001, "get_velocity")
         assert np.mean(np.diff(velocity) == 0.0) == pytest.approx(0.445, abs=0.015)
 
     def test_new_samples_come_after_one_or_two_milliseconds(self):
-        with make_lab("hardware", **AT_ONCE) as lab:
+        with make_lab(**AT_ONCE) as lab:
             client, token = experiment(lab)
             velocity = track(lab, client, token, 5.0, 0.0005, "get_velocity")
         gaps = np.diff(np.flatnonzero(np.diff(velocity)))
@@ -208,7 +207,7 @@ class TestReadings:
         assert np.mean(gaps == 2) == pytest.approx(0.2, abs=0.03)
 
     def test_velocity_lags(self):
-        with make_lab(velocity_lag=LAG) as lab:
+        with ideal_lab(velocity_lag=LAG) as lab:
             client, token = experiment(lab, "DoubleIntegrator")
             client.set_torque(0.006, token)
             lab.clock.advance(0.2)
@@ -219,14 +218,14 @@ class TestReadings:
 
 class TestFriction:
     def test_each_hardware_cell_draws_its_own(self):
-        with make_lab("hardware") as lab:
-            drawn = [cell._parameters["c"] for cell in lab._bookings.cells[:4]]
+        with make_lab() as lab:
+            drawn = [cell._parameters["c"] for cell in lab._cells[:4]]
         assert len(set(drawn)) == 4
-        assert min(drawn) >= HARDWARE.coulomb_friction[0] == 1.7e-3
-        assert max(drawn) <= HARDWARE.coulomb_friction[1] == 3.9e-3
+        assert min(drawn) >= Options.coulomb_friction[0] == 1.7e-3
+        assert max(drawn) <= Options.coulomb_friction[1] == 3.9e-3
 
     def test_swing_dies_as_the_equation_says(self):
-        with make_lab(coulomb_friction=(2e-3, 2e-3)) as lab:
+        with ideal_lab(coulomb_friction=(2e-3, 2e-3)) as lab:
             client, token = experiment(lab, initial_position=[1.5])
             swing = track(lab, client, token, 3.0)
         reference, _ = free_fall(1.5, np.arange(151) * 0.02, friction=2e-3)
@@ -236,7 +235,7 @@ class TestFriction:
 
 class TestNetwork:
     def test_call_times(self):
-        with make_lab("hardware") as lab:
+        with make_lab() as lab:
             client, token = experiment(lab, length=60.0)
             times = {"get": [], "set": []}
             for _ in range(6000):
@@ -259,7 +258,7 @@ class TestSeeds:
     def test_equal_seeds_give_equal_readings(self):
         readings = {}
         for seed in (1, 1, 2):
-            with Lab("hardware", clock=ManualClock(), seed=seed) as lab:
+            with make_lab(seed=seed) as lab:
                 client, token = experiment(lab, initial_position=[1.0])
                 swing = track(lab, client, token, 1.0, getter="get_velocity")
             readings.setdefault(seed, []).append(swing)

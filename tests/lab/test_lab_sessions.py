@@ -7,10 +7,10 @@ import time
 
 import numpy as np
 import pytest
-from lab_tools import TOKEN, experiment, track
+from lab_tools import TOKEN, experiment, ideal_lab, track
 from zoo_tools import resident_bytes
 
-from fmugym.lab import CellType, Client, Lab, LabError, ManualClock
+from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, RealClock
 
 SINGLE = [CellType.SINGLE]
 
@@ -48,8 +48,6 @@ class TestHeartbeat:
             lambda client, token: client.set_velocity(0.0, token),
             lambda client, token: client.set_torque(0.0, token),
             lambda client, token: client.set_impedance_controller_params(0, 0, token),
-            lambda client, token: client.get_actuator_info(token),
-            lambda client, token: client.get_logs(token),
         ],
     )
     def test_every_request_is_one(self, lab, client, request_of):
@@ -74,17 +72,8 @@ class TestHeartbeat:
         lab.clock.advance(30.0)
         client.start_episode(gym, "SimplePendulum", 1)
 
-    def test_watching_is_none(self, lab, client):
-        gym = client.start_gym(TOKEN, 60, SINGLE)
-        token, _ = client.start_episode(gym, "SimplePendulum", 10)
-        for _ in range(3):
-            lab.clock.advance(1.0)
-            lab.view(gym)
-        with pytest.raises(LabError, match="the episode has ended: no request"):
-            client.get_position(token)
-
     def test_its_time_is_an_option(self):
-        with Lab("ideal", clock=ManualClock(), heartbeat=20.0) as lab:
+        with ideal_lab(heartbeat=20.0) as lab:
             client, token = experiment(lab)
             lab.clock.advance(19.0)
             client.get_position(token)
@@ -163,7 +152,6 @@ class TestTokens:
             ("user", "stop_gym"),
             ("episode", "stop_gym"),
             ("gym", "get_user_info"),
-            ("episode", "get_cells"),
         ],
     )
     def test_of_the_wrong_kind(self, client, tokens, kind, method):
@@ -181,7 +169,7 @@ class TestTokens:
             client.start_gym(tokens[kind], 10, SINGLE)
 
     def test_of_another_lab(self, tokens):
-        with Lab("ideal", clock=ManualClock()) as other:
+        with ideal_lab() as other:
             client = Client(other)
             with pytest.raises(LabError, match="unknown"):
                 client.get_position(tokens["session"])
@@ -221,7 +209,7 @@ class TestWaiting:
         assert lab.clock.time() == pytest.approx(1.6, abs=0.03)
 
     def test_a_cell_of_an_abandoned_session_is_freed(self, lab, client):
-        with Lab("ideal", clock=lab.clock, cells={CellType.SINGLE: 1}):
+        with ideal_lab(clock=lab.clock, cells={CellType.SINGLE: 1}):
             client = Client()
             client.start_experiment(TOKEN, "SimplePendulum", 60)
             client.start_experiment(TOKEN, "SimplePendulum", 60)
@@ -273,7 +261,7 @@ class TestThreads:
             thread.start()
         for thread in threads:
             thread.join(30)
-        alone, token = experiment(Lab("ideal", clock=ManualClock()), initial_position=[0.5])
+        alone, token = experiment(ideal_lab(), initial_position=[0.5])
         assert len(swings) == 4
         assert swings[0.5] == track(alone.lab, alone, token, 2.0)
         assert swings[1.0] == pytest.approx([-q for q in swings[-1.0]], abs=1e-9)
@@ -296,7 +284,7 @@ class TestThreads:
             client.get_position(tokens[0])
 
     def test_close_while_others_work(self):
-        lab, at_work, refused = Lab("ideal"), threading.Barrier(5), []
+        lab, at_work, refused = ideal_lab(clock=RealClock()), threading.Barrier(5), []
 
         def work():
             own = Client(lab)
@@ -318,7 +306,7 @@ class TestThreads:
         assert refused == ["the lab is closed"] * 4
 
     def test_close_while_others_wait_for_a_cell(self):
-        lab, refused = Lab("ideal", cells={CellType.SINGLE: 1}), []
+        lab, refused = ideal_lab(clock=RealClock(), cells={CellType.SINGLE: 1}), []
         Client(lab).start_gym(TOKEN, 60, SINGLE)
 
         def wait():
@@ -342,7 +330,7 @@ def resources():
 
 class TestNothingLeaks:
     def test_over_200_sessions(self, temp_root):
-        with Lab("ideal", clock=ManualClock(), seed=0) as lab:
+        with ideal_lab() as lab:
             client = Client()
             gym = client.start_gym(TOKEN, 3000, SINGLE * 2)
 
@@ -373,7 +361,7 @@ class TestNothingLeaks:
 
     def test_over_50_labs(self, temp_root):
         def live():
-            with Lab("hardware", clock=ManualClock()) as lab:
+            with Lab(clock=ManualClock()) as lab:
                 client, token = experiment(lab, initial_position=[1.0])
                 client.get_position(token)
 
@@ -387,7 +375,7 @@ class TestNothingLeaks:
         assert list(temp_root.iterdir()) == []
 
     def test_a_lab_that_was_forgotten(self, temp_root):
-        client, token = experiment(Lab("ideal", clock=ManualClock()))
+        client, token = experiment(ideal_lab())
         assert np.isfinite(client.get_position(token))
         del client
         gc.collect()

@@ -1,4 +1,4 @@
-"""Odd values for the programs that call public functions with them, such as ``fuzz_lab.py``."""
+"""Odd values for the programs that call public functions with them, such as ``fuzz_face.py``."""
 
 import datetime
 import decimal

@@ -1,4 +1,4 @@
-"""The options of a lab, and the two named presets."""
+"""Options of a simulated lab."""
 
 from __future__ import annotations
 
@@ -7,49 +7,37 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.checks import check_flag, check_integer, check_number, check_option
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["HARDWARE", "IDEAL", "PRESETS", "Options", "make_options"]
+__all__ = ["Options"]
 
 _SHARES: Final = ("early_sample_share", "stall_share")
-_LIMITS: Final = (
-    *("heartbeat", "torque_limit", "velocity_limit", "position_limit", "peak_torque"),
-    "hold_stiffness",
+_MAY_BE_INFINITE: Final = (
+    *("heartbeat", "torque_limit", "velocity_limit", "position_limit", "hold_stiffness"),
 )
-"""These options may be infinite."""
-
 _HIGHEST: Final = 1e6
 _LARGEST_SPREAD: Final = 1000.0  # of a 99th percentile, in medians
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a lab simulates. The defaults are those of the preset ``ideal``.
+    """Properties of the cells and of the way to them, as close to the real lab as is public.
 
     The values of a pair are for shoulder and elbow; a cell with one joint uses the first one.
 
-    Each text ends with the source of the value in the preset ``hardware``. *Measured*: seen in
-    public logs and recordings of the lab, all of the double pendulum. *Borrowed*: measured on the
-    double pendulum, used for the single pendulum. *Documented*: stated by the lab. *Nominal*:
-    plausible, without a source.
+    Each text ends with the source of the default. *Measured*: seen in public logs and recordings of
+    the lab, all of the double pendulum. *Borrowed*: measured on the double pendulum, used for the
+    single pendulum. *Documented*: stated by the lab. *Nominal*: plausible, without a source.
 
     Attributes:
         heartbeat: A session ends after this time without a request, in s; documented.
         session_grace: How much longer than its time a session lasts, in s. The grace lets a last
             request in that the network or a busy machine delays; nominal.
         homing_time: Time that a cell takes to reach its start position, in s; nominal.
-        starts_per_window: How many experiments, gyms and episodes a user may start within
-            ``start_window``; None for any number. A limit exists, its value is nominal.
-        start_window: Length of this window, in s; nominal.
-        torque_limit: Largest torque of a drive, in N m; measured.
+        torque_limit: Largest torque of a drive, in N m, to which it limits its torque; measured.
         velocity_limit: Angular velocity at which a session ends, in rad/s; documented.
         position_limit: Angle from hanging at which a session ends, in rad; documented, 360 degrees.
-        saturate_torque: Whether a drive limits its torque to ``torque_limit``. Otherwise it gives
-            up to ``peak_torque``, and a torque beyond ``torque_limit`` ends the session.
-        peak_torque: Largest torque of the motor, in N m; data sheet.
-        clamp_setters: Whether the client clamps values to the limits, as the local client does.
-            Otherwise it refuses values beyond them.
         hold_stiffness: Stiffness of the controller that holds the start position, in N m/rad. It
             does not compensate gravity, so the arm sags. Infinity holds the exact position.
             Measured.
@@ -80,27 +68,22 @@ class Options:
 
     heartbeat: float = 2.0
     session_grace: float = 0.1
-    homing_time: float = 0.0
-    starts_per_window: int | None = None
-    start_window: float = 10.0
+    homing_time: float = 1.0
     torque_limit: float = 0.15
     velocity_limit: float = 50.0
     position_limit: float = math.tau
-    saturate_torque: bool = True
-    peak_torque: float = 0.45
-    clamp_setters: bool = True
-    hold_stiffness: float = math.inf
+    hold_stiffness: float = 0.43
     drive_step: float = 0.0005
-    coulomb_friction: tuple[float, float] = (0.0, 0.0)
-    sample_period: float = 0.0
-    early_sample_share: float = 0.0
-    encoder_step: tuple[float, float] = (0.0, 0.0)
-    velocity_lag: float = 0.0
-    velocity_noise: tuple[float, float] = (0.0, 0.0)
-    torque_noise: float = 0.0
-    get_time: tuple[float, float] = (0.0, 0.0)
-    set_time: tuple[float, float] = (0.0, 0.0)
-    stall_share: float = 0.0
+    coulomb_friction: tuple[float, float] = (1.7e-3, 3.9e-3)
+    sample_period: float = 0.002
+    early_sample_share: float = 0.2
+    encoder_step: tuple[float, float] = (math.tau / 2**17, math.tau / 2**14)
+    velocity_lag: float = 0.00375
+    velocity_noise: tuple[float, float] = (0.04, 0.3)
+    torque_noise: float = 0.0004
+    get_time: tuple[float, float] = (0.00023, 0.0009)
+    set_time: tuple[float, float] = (0.00033, 0.00135)
+    stall_share: float = 0.002
     shortest_stall: float = 0.01
     longest_stall: float = 0.049
 
@@ -121,13 +104,9 @@ class Options:
 def _checked(name: str, value: Any, default: Any) -> Any:
     if isinstance(default, tuple):
         return _pair(name, value)
-    if isinstance(default, bool):
-        return check_flag(name, value)
-    if name == "starts_per_window":
-        return None if value is None else check_integer(name, value, 0, 10**9)
     if name == "drive_step":
         return check_number(name, value, 1e-5, 2e-3)
-    if name in _LIMITS:
+    if name in _MAY_BE_INFINITE:
         return check_number(name, value, 0.0, may_be_infinite=True)
     return check_number(name, value, 0.0, 1.0 if name in _SHARES else _HIGHEST)
 
@@ -142,44 +121,3 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
 def _require_order(name: str, pair: tuple[float, float]) -> None:
     if pair[0] > pair[1]:
         raise ConfigError(f"{name}: {pair[0]:g} must not be greater than {pair[1]:g}")
-
-
-IDEAL: Final = Options()
-"""The lab's rules and limits, with cells without friction, noise and delay of their own."""
-
-HARDWARE: Final = Options(
-    homing_time=1.0,
-    starts_per_window=30,
-    hold_stiffness=0.43,
-    coulomb_friction=(1.7e-3, 3.9e-3),
-    sample_period=0.002,
-    early_sample_share=0.2,
-    encoder_step=(math.tau / 2**17, math.tau / 2**14),
-    velocity_lag=0.00375,
-    velocity_noise=(0.04, 0.3),
-    torque_noise=0.0004,
-    get_time=(0.00023, 0.0009),
-    set_time=(0.00033, 0.00135),
-    stall_share=0.002,
-)
-"""The real cells, as closely as public measurements allow."""
-
-PRESETS: Final = {"ideal": IDEAL, "hardware": HARDWARE}
-
-
-def make_options(preset: str | Options, **changes: Any) -> Options:
-    """Take a preset and change some of its options.
-
-    Args:
-        preset: The name of one of ``PRESETS``, or your own options.
-        changes: New values by name.
-
-    Raises:
-        ConfigError: If the preset or an option does not exist, or a value is out of its range.
-    """
-    if not isinstance(preset, Options):
-        preset = PRESETS[check_option("preset", preset, PRESETS)]
-    known = [field.name for field in dataclasses.fields(Options)]
-    for name in changes:
-        check_option("option of the lab", name, known)
-    return dataclasses.replace(preset, **changes)
