@@ -79,17 +79,6 @@ _MODULES = {
     "task.snapshot": ["Snapshot"],
     "vector": ["FMUVectorEnv"],
 }
-_MOVED = {
-    "archive": ["ArchiveLimits"],
-    "config": ["EnvConfig"],
-    "fmi": ["Status"],
-    "linearization": ["LinearModel", "derivatives", "linearize", "linearize_along"],
-    "pool": ["Backend", "Paced"],
-    "recording": ["Recorder", "Recording", "replay"],
-    "training.agents": ["load_agent"],
-}
-"""Names that were in ``__all__``: they warn for one release, and go after that."""
-
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),
     *("errors", "fmi", "identification", "lab", "linearization", "pool", "recording"),
@@ -103,9 +92,7 @@ def _places(rooms: dict[str, list[str]]) -> dict[str, str]:
     return {name: f"{__name__}.{room}" for room, names in rooms.items() for name in names}
 
 
-__getattr__ = lazily(
-    __name__, {room: f"{__name__}.{room}" for room in _ROOMS} | _places(_MODULES), _places(_MOVED)
-)
+__getattr__ = lazily(__name__, {room: f"{__name__}.{room}" for room in _ROOMS} | _places(_MODULES))
 
 
 def __dir__() -> list[str]:

@@ -48,7 +48,6 @@ from fmugym.pool.spec import (
     SOLVERS,
     ResetMethod,
 )
-from fmugym.retired import grouped
 from fmugym.signals import ordinary
 
 __all__ = ["CONFIG", "FOREIGN", "EnvConfig", "Foreign"]
@@ -358,11 +357,7 @@ class EnvConfig:
             return config
         if not isinstance(config, Mapping):
             raise ConfigError(f"config must be a dict, got {type(config).__name__}")
-        given = check_mapping("config", config)
-        own, foreign = grouped(given, FOREIGN.keys, "the table 'foreign' of the config")
-        if foreign:
-            own["foreign"] = {**foreign, **check_mapping("foreign", own.get("foreign", {}))}
-        return cls(**checked(CONFIG, own))
+        return cls(**checked(CONFIG, check_mapping("config", config)))
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -22,7 +22,6 @@ from fmugym.checks import (
     check_text,
 )
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.retired import without_retired
 
 __all__ = [
     "COUNT",
@@ -248,7 +247,6 @@ class _Reading(NamedTuple):
         items = {table.short: value} if is_short else self._items(keys, value)
         if items is None:
             return None
-        items = without_retired(items)
         given = {
             name: self._value(table, name, keys if is_short else (*keys, name), one)
             for name, one in items.items()

@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from types import MappingProxyType
 from typing import Any
 
 __all__ = ["lazily"]
 
 
-def lazily(
-    package: str, modules: Mapping[str, str], moved: Mapping[str, str] = MappingProxyType({})
-) -> Callable[[str], Any]:
+def lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
     """Make the ``__getattr__`` of a package (PEP 562).
 
     Args:
         package: Its name.
         modules: The module of each name; of a module of the package, its own.
-        moved: The module of each name that has moved there. They give a ``DeprecationWarning``.
 
     Returns:
         A function that imports a name, keeps it in the package and returns it. It raises an
@@ -28,10 +23,6 @@ def lazily(
     """
 
     def get(name: str) -> Any:
-        if name in moved:
-            text = f"{package}.{name} has moved: import it from {moved[name]}"
-            warnings.warn(text, DeprecationWarning, stacklevel=2)
-            return getattr(import_module(moved[name]), name)
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         module = import_module(modules[name])

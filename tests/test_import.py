@@ -1,7 +1,5 @@
 """What ``import fmugym`` imports, and the names that come later."""
 
-import pkgutil
-
 import pytest
 from process_tools import run_python
 
@@ -59,29 +57,6 @@ def test_every_public_name_is_there():
         assert name in dir(fmugym)
     program = "from fmugym import *; print(CartPole := envs.CartPoleEnv, FMUVectorEnv, register)"
     assert "fmugym.vector.vector_env.FMUVectorEnv" in " ".join(run(program))
-
-
-MOVED = {
-    "archive": ["ArchiveLimits"],
-    "config": ["EnvConfig"],
-    "fmi": ["Status"],
-    "linearization": ["LinearModel", "derivatives", "linearize", "linearize_along"],
-    "pool": ["Backend", "Paced"],
-    "recording": ["Recorder", "Recording", "replay"],
-    "training.agents": ["load_agent"],
-}
-
-
-@pytest.mark.parametrize(("room", "name"), [(r, name) for r in MOVED for name in MOVED[r]])
-def test_a_name_that_has_moved_warns_and_is_what_it_was(room, name):
-    place = f"fmugym.{room}"
-    for old in (f"value = fmugym.{name}", f"from fmugym import {name} as value"):
-        with pytest.warns(DeprecationWarning, match=f"{name} has moved.* from {place}") as told:
-            exec(compile(old, __file__, "exec"), {"fmugym": fmugym}, found := {})
-        assert {one.filename for one in told} == {__file__}
-        assert found["value"] is pkgutil.resolve_name(f"{place}.{name}")
-    assert name not in fmugym.__all__
-    assert name not in dir(fmugym)
 
 
 @pytest.mark.parametrize("name", ["lab", "testing", "identification", "rendering", "vector"])

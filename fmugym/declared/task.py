@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.checks import check_mapping, check_path, require_regular
-from fmugym.config import FOREIGN
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.seasons import read_scenarios
@@ -25,7 +24,6 @@ from fmugym.declared.writing import as_toml, revised, write_new
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
 from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
-from fmugym.retired import grouped
 from fmugym.signals import ordinary
 
 __all__ = ["Task"]
@@ -140,7 +138,7 @@ class Task:
     ) -> Task:
         start = Path.cwd() if folder is None else check_path("folder", folder).absolute()
         _require_shallow(document)
-        plain: dict[str, Any] = _grouped(_plain(check_mapping("config", document)))
+        plain: dict[str, Any] = _plain(check_mapping("config", document))
         source = Source(None, start, "", _with_paths(plain, start))
         _check(source)
         if "extends" not in plain:
@@ -279,7 +277,7 @@ def _read(path: Path) -> Source:
     except ordinary(OSError) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     document = _parsed(path, text)
-    source = Source(path, path.parent, text, _with_paths(_grouped(_plain(document)), path.parent))
+    source = Source(path, path.parent, text, _with_paths(_plain(document), path.parent))
     _check(source)
     return source
 
@@ -395,17 +393,6 @@ def _with_index(items: Mapping[Any, Any]) -> Mapping[Any, Any]:
     if not _is_column(index) or items.keys() & {"times", "step"}:
         return items
     return {**items, "times": index}
-
-
-def _grouped(document: dict[str, Any]) -> dict[str, Any]:
-    """Move keys for experts from where they stood in earlier versions."""
-    config = document.get("config")
-    if not isinstance(config, dict):
-        return document
-    own, foreign = grouped(config, FOREIGN.keys, "[foreign]")
-    if not foreign:
-        return document
-    return _merge({"foreign": foreign}, {**document, "config": own})
 
 
 def _named(value: type) -> Any:

@@ -24,7 +24,6 @@ from fmugym.keys import (
     option,
     table_of,
 )
-from fmugym.retired import without_retired
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
 from fmugym.systems.order import Order, order_of
@@ -115,7 +114,7 @@ class WiredSystem:
         file: Path | None = None,
         **unknown: Never,
     ) -> None:
-        for argument in without_retired(unknown):
+        for argument in unknown:
             raise unknown_argument(type(self).__name__, argument, _ARGUMENTS)
         told = {
             "components": components,

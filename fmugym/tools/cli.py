@@ -95,7 +95,6 @@ from fmugym.tools.learning import add_train
 from fmugym.tools.options import add_common, free_outputs, note, speaking
 from fmugym.tools.plants import add_serve
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
-from fmugym.tools.renamed import renamed
 from fmugym.tools.standard_streams import (
     drop_output,
     escape_what_consoles_lack,
@@ -210,7 +209,7 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
     parser, commands = _parser()
     argcomplete.autocomplete(parser)
-    given = renamed(sys.argv[1:] if argv is None else argv)
+    given = sys.argv[1:] if argv is None else argv
     if given and not given[0].startswith("-") and given[0] not in commands:
         parser.error(str(unknown_name("command", given[0], commands)))
     if given and given[0].startswith("-") and given[0] not in parser.options:

@@ -15,13 +15,12 @@ from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.wishes import Wishes
-from fmugym.retired import warn_of_gone
 
 __all__ = ["pool_of_backend"]
 
 logger = logging.getLogger(__name__)
 
-_NAMES: Final = ("auto", "fmpy", "fmu", "native", "python")
+_NAMES: Final = ("auto", "fmpy", "fmu", "native")
 
 
 def pool_of_backend(
@@ -53,12 +52,10 @@ def _steps_by_fmpy(backend: str) -> bool:
     check_option("backend", backend, _NAMES)
     if backend == "native" and not has_native_pool():
         raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
-    if backend == "python":
-        warn_of_gone("backend='python' means 'fmpy' now: say so")
     if backend in ("auto", "fmu") and not has_native_pool():
         warn_once(logger, f"FMUs are stepped by FMPy, which is slow: {HOW_TO_BUILD}")
         return True
-    return backend in ("fmpy", "python")
+    return backend == "fmpy"
 
 
 @licence_errors()

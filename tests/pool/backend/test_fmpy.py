@@ -197,9 +197,3 @@ class TestRefusals:
         path = edited_fmu(probe(1), tmp_path, edits, add=renamed)
         with pytest.raises(FMULoadError, match=r"cannot be loaded: .*Other_fmi"):
             PlainEnv(path, fmu_tools.probe_config(), backend="fmpy")
-
-
-def test_python_means_fmpy_now():
-    with pytest.warns(FutureWarning, match="'fmpy'"):
-        env = gym.make("fmugym/Pendulum-v0", backend="python")
-    env.close()
