@@ -512,10 +512,9 @@ static void read_ends(Reader *reader, System *s) {
     free((void *)arrays.starts);
 }
 
-static void read_loop(Reader *reader, LoopMethod *loop, bool *has_loop, const char **label) {
+static void read_loop(Reader *reader, LoopLimits *loop, bool *has_loop, const char **label) {
     *has_loop = read_flag(reader);
     if (*has_loop) {
-        loop->newton = read_flag(reader);
         loop->iterations = read_integer_in(reader, 1, INT64_MAX);
         loop->tolerance = read_number(reader);
         *label = read_text(reader);

@@ -1,13 +1,12 @@
 #include "loops.h"
 
 #include <math.h>
-#include <string.h>
 
 /* How far an unknown moves to see what depends on it, as a part of the larger of its magnitude and
  * 1. FMUs with solvers of their own have errors of this order. */
 static const double NUDGE = 0x1p-14;
 
-static bool agree(const LoopMethod *loop, size_t n, const double *x, const double *y) {
+static bool agree(const LoopLimits *loop, size_t n, const double *x, const double *y) {
     for (size_t i = 0; i < n; i++) {
         const double size = fabs(y[i]) > 1.0 ? fabs(y[i]) : 1.0;
         if (!(fabs(y[i] - x[i]) <= loop->tolerance * size)) {
@@ -95,7 +94,7 @@ static Status improve(size_t n, double *x, const double *y, double *rest, double
     return status;
 }
 
-Status loop_solve(const LoopMethod *loop, size_t n, double *memory, Evaluate *evaluate, void *context) {
+Status loop_solve(const LoopLimits *loop, size_t n, double *memory, Evaluate *evaluate, void *context) {
     double *x = memory, *y = memory + n, *rest = memory + 2 * n, *matrix = memory + 3 * n;
 
     for (int64_t i = 0; i < loop->iterations; i++) {
@@ -103,11 +102,7 @@ Status loop_solve(const LoopMethod *loop, size_t n, double *memory, Evaluate *ev
         if (status > STATUS_WARNING || agree(loop, n, x, y)) {
             return status;
         }
-        if (loop->newton) {
-            status = improve(n, x, y, rest, matrix, evaluate, context);
-        } else {
-            memcpy(x, y, n * sizeof *x);
-        }
+        status = improve(n, x, y, rest, matrix, evaluate, context);
         if (status > STATUS_WARNING) {
             return status;
         }

@@ -1,4 +1,4 @@
-/* Solves x = y(x) for the values of the links of an algebraic loop. */
+/* Newton's method for the values x = y(x) of the links of an algebraic loop. */
 
 #ifndef FMUGYM_LOOPS_H
 #define FMUGYM_LOOPS_H
@@ -6,10 +6,9 @@
 #include "fmi.h"
 
 typedef struct {
-    bool newton; /* or else fixed-point iteration */
     double tolerance;
     int64_t iterations; /* the most */
-} LoopMethod;
+} LoopLimits;
 
 /* Computes y of x. */
 typedef Status Evaluate(void *context, const double *x, double *y);
@@ -21,6 +20,6 @@ static inline size_t loop_memory(size_t n) {
 
 /* Begins at the x that it finds in its memory, and ends right after an evaluation that agrees with
  * its x. Returns Discard if there is none. Every status that is worse than a warning ends it. */
-Status loop_solve(const LoopMethod *loop, size_t n, double *memory, Evaluate *evaluate, void *context);
+Status loop_solve(const LoopLimits *loop, size_t n, double *memory, Evaluate *evaluate, void *context);
 
 #endif

@@ -85,7 +85,7 @@ typedef struct {
     size_t number_of_routes;
     size_t unknowns; /* the values that the routes carry */
     bool has_loop;
-    LoopMethod loop;
+    LoopLimits loop;
     const char *label; /* names it in messages */
 } PartGroup;
 
@@ -95,7 +95,7 @@ typedef struct {
     size_t count;
     size_t unknowns; /* the values that they carry */
     bool has_loop;
-    LoopMethod loop;
+    LoopLimits loop;
     const char *label;
 } Transfer;
 

@@ -498,7 +498,7 @@ def _type(layout: Layout, end: PartVariable) -> int:
 def _write_loop(writer: Writer, loop: Loop | None, label: str) -> None:
     writer.integers(loop is not None)
     if loop is not None:
-        writer.integers(loop.method == "newton", loop.max_iterations)
+        writer.integers(loop.max_iterations)
         writer.numbers(loop.tolerance)
         writer.text(label.encode())
 

@@ -10,7 +10,6 @@ from typing import Any, Self
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMUGymError
-from fmugym.systems.drawing import draw
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.wired import WiredSystem
 
@@ -31,7 +30,7 @@ class FMUSystem(WiredSystem):
         units: Units of the system's own inputs, outputs and parameters by name; without one, they
             have the unit of the variable behind them.
         master: ``"gauss_seidel"``, where each component gets the newest values, or ``"jacobi"``.
-        loops: How algebraic loops are solved: ``"newton"``, ``"fixed_point"``, or ``"refuse"``.
+        loops: How algebraic loops are solved: ``"newton"``, or ``"refuse"``.
         loop_tolerance: Relative, and absolute below 1, for the values in a loop.
         loop_iterations: After so many, a step fails.
         step_size: The default communication step size in seconds; without one, the smallest
@@ -104,21 +103,6 @@ class FMUSystem(WiredSystem):
             FMULoadError: If an FMU of a component cannot be read any more.
         """
         return SystemFMU(self.plan, probe_timeout=probe_timeout)
-
-    def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Draw the system: components, connections with their gains, inputs, outputs, loops.
-
-        Args:
-            path: A file to write, such as ``system.png`` or ``system.svg``; None for no file.
-
-        Returns:
-            The figure of Matplotlib.
-
-        Raises:
-            ConfigError: If Matplotlib is missing (extra ``plot``), the format of the file is
-                unknown, or the file cannot be written.
-        """
-        return draw(self, path)
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         """A system pickles as the file that it came from, or as its arguments."""

@@ -27,7 +27,6 @@ from fmugym.archive.description import Unit
 from fmugym.archive.safe_zip import ArchiveLimits
 
 __all__ = [
-    "LOOP_METHODS",
     "MASTERS",
     "Component",
     "Connector",
@@ -41,9 +40,6 @@ __all__ = [
 
 MASTERS: Final = ("gauss_seidel", "jacobi")
 """The orders in which values are exchanged and components step, the preferred one first."""
-
-LOOP_METHODS: Final = ("newton", "fixed_point")
-"""How algebraic loops are solved, the preferred method first."""
 
 
 @dataclass(frozen=True)
@@ -95,16 +91,14 @@ class Link:
 
 @dataclass(frozen=True)
 class Loop:
-    """How an algebraic loop is solved.
+    """Limits of Newton's method, which solves an algebraic loop.
 
     Attributes:
-        method: One of ``LOOP_METHODS``.
         tolerance: The loop is solved when no value that a link of it carries differs by more than
             ``tolerance * max(1, abs(value))`` from what it was in the iteration before.
         max_iterations: After so many, the step or the initialization fails with Discard.
     """
 
-    method: str = LOOP_METHODS[0]
     tolerance: float = 1e-9
     max_iterations: int = 50
 

@@ -27,12 +27,12 @@ from fmugym.keys import (
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
 from fmugym.systems.order import Order, order_of
-from fmugym.systems.system_plan import LOOP_METHODS, MASTERS, Link, Loop, SystemPlan
+from fmugym.systems.system_plan import MASTERS, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
 __all__ = ["LOOPS", "SYSTEM", "WiredSystem"]
 
-LOOPS: Final = (*LOOP_METHODS, "refuse")
+LOOPS: Final = ("newton", "refuse")
 """What is done about algebraic loops."""
 
 
@@ -136,8 +136,7 @@ class WiredSystem:
             raise ConfigError("a system needs at least one component")
         self.name, self.description = given["name"], given["description"]
         self.units, self.master, self.loops = given["units"], given["master"], given["loops"]
-        method = LOOP_METHODS[0] if self.loops == "refuse" else self.loops
-        self.loop = Loop(method, given["loop_tolerance"], given["loop_iterations"])
+        self.loop = Loop(given["loop_tolerance"], given["loop_iterations"])
         self.times = {name: given[name] for name in _TIMES}
         self._given_findings, self.file = tuple(findings), file
         self.connections = tuple(given["connections"])

@@ -2,7 +2,7 @@
 
 ::
 
-    fmugym info model.fmu|system.ssp|task.toml [--all] [--filter GLOB] [--plot system.svg]
+    fmugym info model.fmu|system.ssp|task.toml [--all] [--filter GLOB]
     fmugym info --repair model.fmu [--output PATH]
     fmugym info minari:NAME [--output FOLDER]
     fmugym new model.fmu [--class] [--output task.toml]

@@ -59,12 +59,6 @@ def add_info(commands: Commands) -> None:
     )
     add_master(command)
     add_json(command)
-    command.add_argument(
-        "--plot",
-        type=Path,
-        metavar="FILE",
-        help="draw the system of an SSP archive or a task file, for example system.svg",
-    )
     command.add_argument("--all", action="store_true", help="list local and other variables too")
     command.add_argument(
         "--filter",
@@ -101,12 +95,8 @@ def _info(arguments: argparse.Namespace) -> None:
     wanted = {"everything": arguments.all, "pattern": arguments.filter}
     if isinstance(model, FMUSystem):
         facts, as_lines = overview_of_system(model, **wanted), as_text_of_system
-        if arguments.plot is not None:
-            model.plot(arguments.plot)
-    elif arguments.plot is None:
-        facts, as_lines = overview(model, **wanted), as_text
     else:
-        raise ConfigError("--plot is for systems; an FMU alone has no connections to draw")
+        facts, as_lines = overview(model, **wanted), as_text
     if path.suffix.lower() == ".toml":
         facts["data"] = overview_of_data(Task.read(path))
     if arguments.json:

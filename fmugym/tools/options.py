@@ -72,7 +72,7 @@ EXAMPLES: Final = {
     "info": (
         "fmugym info model.fmu",
         "fmugym info --filter 'theta*' model.fmu",
-        "fmugym info system.ssp --plot system.svg",
+        "fmugym info system.ssp",
         "fmugym info --repair model.fmu",
         "fmugym info minari:swing/random-v0 --output episodes",
     ),

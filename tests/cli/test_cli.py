@@ -476,7 +476,6 @@ class TestCommand:
         [
             "new wrong.fmu --output out.toml",
             "new --class wrong.fmu --output out.py",
-            "info wrong.fmu --plot out.svg",
             "simulate wrong.toml --output out.csv --output out.html",
             "evaluate wrong.toml --plot out.png",
             "tune wrong.toml 'pid of=q setpoint=1 kp=0..1' --output out.toml",

@@ -12,7 +12,6 @@ from fmu_tools import PlainEnv
 import fmugym
 from fmugym import Component, ConfigError, FMUSystem, TaskError, bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters
-from fmugym.systems.placing import picture_of
 from fmugym.testing import check_fmu_env
 
 HOUSE = bundled_fmu("House")
@@ -237,10 +236,9 @@ def test_the_master_of_an_archive_can_be_chosen(archive):
 
 
 class TestCommandLine:
-    def test_info_of_an_archive_and_of_a_task(self, archive, task, tmp_path, ran):
-        for number, path in enumerate((archive, task())):
-            picture = tmp_path / f"{number}.svg"
-            text = ran("info", path, "--plot", picture)
+    def test_info_of_an_archive_and_of_a_task(self, archive, task, ran):
+        for path in (archive, task()):
+            text = ran("info", path)
             for fact in (
                 "two houses (a system of 2 FMUs)",
                 "east.Q_em -> west.Q_int (* 0.1)",
@@ -248,8 +246,6 @@ class TestCommandLine:
                 "east -> west",
             ):
                 assert fact in text
-            drawn = picture.read_text()
-            assert all(f">{name}<" in drawn for name in ("east", "west", "outside", "Q_int"))
 
     @pytest.mark.parametrize("declared", [True, False])
     def test_the_master_can_be_chosen(self, archive, task, tmp_path, cli, ran, declared):
@@ -291,10 +287,6 @@ class TestCommandLine:
         assert found == cli("info", HOUSE)
         assert found[0] == 0
 
-    def test_the_plot_is_for_systems(self, tmp_path, refused):
-        assert "--plot" in refused("info", HOUSE, "--plot", tmp_path / "x.svg")
-        assert not list(tmp_path.iterdir())
-
     def test_from_an_archive_to_a_task_and_an_episode(self, archive, tmp_path, ran):
         path = tmp_path / "new.toml"
         ran("new", archive, "--output", path)
@@ -309,57 +301,6 @@ class TestCommandLine:
 
     def test_validation_of_an_archive(self, archive, ran):
         assert "repetition" in ran("validate", archive)
-
-
-class TestPictures:
-    LOOP = ("b.Q_em -> a.Q_int", "a.Q_em -> b.Q_int", "b.P -> c.Q_int", "c.T_m -> a.T_out")
-
-    def make(self):
-        links = [*self.LOOP, "T -> b.T_out", "T -> c.T_out", "c.T_air -> y", "u -> a.u"]
-        return FMUSystem({"a": HOUSE, "b": HOUSE, "c": HOUSE}, links)
-
-    def test_boxes_do_not_overlap(self):
-        boxes = list(picture_of(self.make()).boxes.values())
-        assert len(boxes) == 6
-        for number, one in enumerate(boxes):
-            for other in boxes[:number]:
-                beside = one.x >= other.x + other.width or other.x >= one.x + one.width
-                above = one.y - one.height >= other.y or other.y - other.height >= one.y
-                assert beside or above, (one.title, other.title)
-
-    def test_wires_lead_from_port_to_port(self):
-        picture = picture_of(self.make())
-        assert len(picture.wires) == 8
-        for wire in picture.wires:
-            (source, name), (target, other) = wire.source, wire.target
-            assert wire.points[0] == picture.boxes[source].port(name, left=False)
-            assert wire.points[-1] == picture.boxes[target].port(other, left=True)
-
-    def test_loops_are_marked_and_wires_back_run_below(self):
-        picture = picture_of(self.make())
-        marked = {(w.source[0], w.target[0]) for w in picture.wires if w.in_loop}
-        assert marked == {("a", "b"), ("b", "a")}
-        bottom = min(box.y - box.height for box in picture.boxes.values())
-        back = [wire for wire in picture.wires if wire.leads_back]
-        assert back
-        assert all(min(y for _, y in wire.points) < bottom for wire in back)
-
-    def test_files(self, tmp_path):
-        system = self.make()
-        system.plot(tmp_path / "a.png")
-        assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-        for name in ("a.svg", "b.svg"):
-            system.plot(tmp_path / name)
-        text = (tmp_path / "a.svg").read_text()
-        assert text == (tmp_path / "b.svg").read_text()
-        assert "algebraic loop" in text
-        with pytest.raises(ConfigError, match="picture"):
-            system.plot(tmp_path / "a.docx")
-        with pytest.raises(ConfigError, match="picture"):
-            system.plot(tmp_path / "none" / "a.png")
-
-    def test_names_that_look_like_mathematics_are_texts(self, tmp_path):
-        FMUSystem({"$x$": HOUSE}, name="$\\alpha").plot(tmp_path / "a.png")
 
 
 def test_inputs_and_parameters_of_the_system_are_read_in_its_own_units():

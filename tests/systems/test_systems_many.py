@@ -41,7 +41,7 @@ def loop(fmus, master):
     """The first two are an algebraic loop."""
     plan = oscillators(fmus, (2, 3, 1), (1, 1, 1), master, 0.3)
     links = (*plan.links, Link("b", "y1", "a", "u1", -0.5))
-    circle = Loop("newton")
+    circle = Loop()
     evaluations = (Evaluation((0, 3), circle), Evaluation((1,)), Evaluation((2,)))
     groups = (Group(("a", "b"), circle), Group(("c",)))
     return SystemPlan("chain", plan.components, links, groups, evaluations, master)

@@ -70,7 +70,6 @@ def make_system(rng, fmus):
     names, faults = NAMES[: len(versions)], rng.random() < 0.4
     parts = {n: component(rng, fmus[v], faults) for n, v in zip(names, versions, strict=True)}
     options = {"master": rng.choice(("jacobi", "gauss_seidel"))}
-    options["loops"] = rng.choice(("newton", "fixed_point"))
     return FMUSystem(parts, connections(rng, names), **options), versions
 
 

@@ -130,7 +130,6 @@ COMMANDS = {
     ("info", "task.tml"): ("task.tml", "'task.toml'"),
     ("info", "prices.csv"): ("prices.csv", "FMU", "zip"),
     ("info", "model.fmu", "extra"): ("'extra'",),
-    ("info", "model.fmu", "--plot", "a.png"): ("--plot", "systems"),
     ("new", "task.toml"): ("task.toml", "FMU"),
     ("new", "model.fmu", "--output", "no/t.toml"): ("no/t.toml", "'no'"),
     ("validate", "task"): ("'task'", "'task.toml'"),
