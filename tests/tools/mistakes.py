@@ -148,7 +148,7 @@ COMMANDS = {
     ("simulate", "task.toml", "--action", "0,0"): ("'0,0'", "(1,)"),
     ("simulate", "task.toml", "--action", "left"): ("'left'", "random"),
     ("simulate", "task.toml", "--action", "nan"): ("'nan'",),
-    ("simulate", "task.toml", "--action", "0", "--action", "1"): ("'1'", "0.01"),
+    ("simulate", "task.toml", "--action", "1"): ("'1'", "0.01"),
     ("simulate", "task.toml", "--controller", "pid"): ("'of'", "PID"),
     ("simulate", "task.toml", "--controller", "pit of=q"): ("'pit'",),
     ("simulate", "task.toml", "--controller", "pid of=qq setpoint=1 kp=1"): ("'qq'", "'q'"),
