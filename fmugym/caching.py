@@ -10,11 +10,10 @@ import shutil
 import stat
 import sys
 import tempfile
+from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
 from typing import Final
-
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "cache_folder",
@@ -62,7 +61,7 @@ def lasting_folder(*names: str) -> Path:
     Raises:
         OSError: If there can be none there either.
     """
-    with Ignoring(OSError):
+    with suppress(OSError):
         return cache_folder(*names)
     return _private(Path(tempfile.gettempdir(), f"fmugym-{_user()}"), names)
 
@@ -98,7 +97,7 @@ def replace_file(path: Path, content: bytes) -> None:
             file.write(content)
         os.replace(name, path)
     except BaseException:
-        with Ignoring(OSError):
+        with suppress(OSError):
             os.unlink(name)
         raise
 
@@ -114,7 +113,7 @@ def sweep(folder: Path) -> None:
     for path in folder.glob("fmugym-*"):
         name = _NAME.fullmatch(path.name)
         if name and int(name["namespace"]) == _namespace() and not _is_alive(int(name["pid"])):
-            with Ignoring(OSError):  # another process has removed it
+            with suppress(OSError):  # another process has removed it
                 if is_own(path):
                     _remove(path)
 
@@ -131,7 +130,7 @@ def _namespace() -> int:
     """Identify the numbering of processes: containers that share a folder may number them alike."""
     try:
         return os.stat("/proc/self/ns/pid").st_ino
-    except ordinary(OSError):
+    except OSError:
         return 0
 
 

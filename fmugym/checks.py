@@ -15,6 +15,7 @@ import re
 import stat
 import unicodedata
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from functools import cache
 from numbers import Real
 from pathlib import Path
@@ -23,7 +24,6 @@ from typing import Any, Final, Self
 import numpy as np
 
 from fmugym.errors import ArgumentError, ConfigError, shown, unknown_argument, unknown_name
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "LARGEST_COUNT",
@@ -134,7 +134,7 @@ def number_of(what: str, value: Any, *, may_be_boolean: bool = False) -> float:
     if type(value) is float:
         return value
     if _is_real(value) and (may_be_boolean or not _is_boolean(value)):
-        with Ignoring(Exception):  # the number is too large, or the object's own method fails
+        with suppress(Exception):  # the number is too large, or the object's own method fails
             return float(value)
     raise ConfigError(f"{what} must be a number, got {shown(value)}")
 
@@ -220,7 +220,7 @@ def integer_of(value: Any) -> int | None:
         return None
     try:
         return int(operator.index(value))
-    except ordinary(Exception):  # a TypeError; or the object's own method fails
+    except Exception:  # a TypeError; or the object's own method fails
         return None
 
 
@@ -242,7 +242,7 @@ def has_method(value: object, name: str) -> bool:
     """Whether a value has a method of this name; no, if asking it raises an error."""
     try:
         return callable(getattr(value, name, None))
-    except ordinary(Exception):  # the object's own method fails
+    except Exception:  # the object's own method fails
         return False
 
 
@@ -288,7 +288,7 @@ def check_dict(what: str, value: Any) -> dict[Any, Any]:
         ConfigError: If it is none.
     """
     if issubclass(type(value), Mapping):
-        with Ignoring(Exception):  # a mapping of the caller's whose methods fail
+        with suppress(Exception):  # a mapping of the caller's whose methods fail
             return dict(value)
     raise ConfigError(f"{what} must be a dict, got {shown(value)}")
 
@@ -322,7 +322,7 @@ def check_path(what: str, value: Any) -> Path:
     """
     try:
         return Path(os.fsdecode(value)).expanduser()
-    except ordinary(Exception):  # nobody has this home, or the object's method fails
+    except Exception:  # nobody has this home, or the object's method fails
         raise ConfigError(f"{what} must be a path, got {shown(value)}") from None
 
 

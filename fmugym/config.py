@@ -48,7 +48,6 @@ from fmugym.pool.spec import (
     SOLVERS,
     ResetMethod,
 )
-from fmugym.signals import ordinary
 
 __all__ = ["CONFIG", "FOREIGN", "EnvConfig", "Foreign"]
 
@@ -68,7 +67,7 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
 def _listed(value: Any) -> list[Any] | None:
     try:
         return list(value) if isinstance(value, Sequence) else None
-    except ordinary(Exception):  # a sequence of the caller's that fails
+    except Exception:  # a sequence of the caller's that fails
         return None
 
 
@@ -87,7 +86,7 @@ def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
     """
     try:
         array: npt.NDArray[Any] = np.array(value, np.float64)
-    except ordinary(Exception):  # no array, distributions, or objects that are no numbers
+    except Exception:  # no array, distributions, or objects that are no numbers
         array = _drawn_array(what, value)
     is_float = array.dtype != object
     if not array.size or (is_float and not np.isfinite(array).all()):
@@ -120,7 +119,7 @@ def _number(what: str, value: Any, *, may_be_boolean: bool = False) -> Any:
 def _bounds(name: str, limits: Any) -> tuple[float, float]:
     try:
         low, high = (number_of("limit", one, may_be_boolean=True) for one in limits)
-    except ordinary(Exception):  # no pair of numbers, or an object whose own methods fail
+    except Exception:  # no pair of numbers, or an object whose own methods fail
         low = high = math.nan
     if not low < high:
         raise ConfigError(

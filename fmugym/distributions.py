@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import partial
 from typing import Any, Final, NamedTuple, Protocol
@@ -27,7 +28,6 @@ from fmugym.checks import (
     number_of,
 )
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "Choice",
@@ -254,7 +254,7 @@ class Truncated:
         below = math.nextafter(self.low, -math.inf)
         try:
             return float(self.distribution.cdf(self.high) - self.distribution.cdf(below))
-        except ordinary(Exception):  # no distribution of scipy.stats: it is not known
+        except Exception:  # no distribution of scipy.stats: it is not known
             return 1.0
 
     def sample(self, rng: np.random.Generator) -> float:
@@ -295,7 +295,7 @@ def support_of(distribution: Any) -> tuple[float, float]:
         return min(values), max(values)
     if isinstance(distribution, Uniform | LogUniform | Normal):
         return float(distribution.low), float(distribution.high)
-    with Ignoring(Exception):  # no distribution of scipy.stats, or not of single numbers
+    with suppress(Exception):  # no distribution of scipy.stats, or not of single numbers
         low, high = map(float, distribution.support())
         return low, high
     return -math.inf, math.inf
@@ -372,7 +372,7 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
         return value
     try:
         drawn = value.sample(rng) if has_method(value, "sample") else value.rvs(random_state=rng)
-    except ordinary(Exception) as error:
+    except Exception as error:
         raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
     if isinstance(drawn, str):
         return drawn
@@ -446,7 +446,7 @@ def _items(values: Any) -> list[Any]:
         return []
     try:
         return list(values)
-    except ordinary(Exception):  # an iterable of the caller's that fails
+    except Exception:  # an iterable of the caller's that fails
         return []
 
 

@@ -26,8 +26,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from fmugym.signals import ordinary
-
 __all__ = [
     "ArgumentError",
     "ConfigError",
@@ -153,7 +151,7 @@ def shown(value: object) -> str:
     """
     try:
         text = repr(value)
-    except ordinary(Exception):  # an error is being reported already
+    except Exception:  # an error is being reported already
         text = f"<{type(value).__name__} without a repr>"
     if "\n" in text:  # an array
         text = " ".join(text.split())
@@ -185,7 +183,7 @@ def reading(failure: str) -> Iterator[None]:
         yield
     except FMUGymError:
         raise
-    except ordinary(Exception) as error:  # a damaged file may raise anything
+    except Exception as error:  # a damaged file may raise anything
         raise ConfigError(f"{failure}: {reason(error)}") from error
 
 

@@ -20,7 +20,6 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
 from fmugym.recording import FACTS, Recording, element_from, flat_element
-from fmugym.signals import ordinary
 from fmugym.task.snapshot import require_scope, scope_of
 
 try:
@@ -76,7 +75,7 @@ def write_dataset(
             return minari.create_dataset_from_buffers(
                 dataset_id, episodes, **spec, **spaces, **{"requirements": [_REQUIREMENT], **about}
             )
-    except ordinary(ValueError, TypeError, ImportError) as error:
+    except (ValueError, TypeError, ImportError) as error:
         raise ConfigError(f"Minari makes no dataset {shown(dataset_id)}: {reason(error)}") from None
 
 
@@ -105,7 +104,7 @@ _REQUIREMENT: Final = "fmugym-toolbox"
 def _loaded(name: str) -> minari.MinariDataset:
     try:
         return minari.load_dataset(name)
-    except ordinary(FileNotFoundError, ValueError) as error:
+    except (FileNotFoundError, ValueError) as error:
         known = ", ".join(sorted(minari.list_local_datasets())) or "none"
         raise ConfigError(
             f"there is no dataset {shown(name)} on this machine ({reason(error)}); there are: "

@@ -34,7 +34,6 @@ from fmugym.checks import check_seed, require_regular
 from fmugym.env import inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.files import replaced
-from fmugym.signals import ordinary
 from fmugym.task.saving import generator_of, row_of, state_of
 from fmugym.task.snapshot import require_scope, scope_of
 
@@ -138,7 +137,7 @@ class Recording:
                 header = json.loads(file["header"].tobytes())
                 arrays = {name: file[name] for name in _ARRAYS}
             return cls(**_facts(header), **arrays)
-        except ordinary(Exception) as error:  # a damaged file may raise anything
+        except Exception as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"{shown(str(path))} is no recording of an episode: {error}"
             ) from None

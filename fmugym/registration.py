@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, cast
 
 import gymnasium
 
 from fmugym.checks import check_text
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import Ignoring
 from fmugym.vector import vectorized
 from fmugym.vector.entry_points import vector_entry_point
 
@@ -84,7 +84,7 @@ def _entry_point(env: Any) -> Any:
         return env
     if not callable(env):
         raise ConfigError(f"expected a class or 'module:Class', got {shown(env)}")
-    with Ignoring(Exception):  # a callable object of the caller's that has no such names
+    with suppress(Exception):  # a callable object of the caller's that has no such names
         module, name = env.__module__, env.__qualname__
         if getattr(sys.modules[module], name) is env:
             return f"{module}:{name}"

@@ -9,6 +9,7 @@ import hashlib
 import logging
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +23,6 @@ from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
-from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.libraries import make_vector_env
 
 try:
@@ -100,7 +100,7 @@ class _Files:
         """
         try:
             data = Path(path).expanduser().read_bytes()
-        except ordinary(OSError) as error:
+        except OSError as error:
             raise ConfigError(f"{shown(str(path))} cannot be read: {reason(error)}") from None
         place = f"{hashlib.sha256(data).hexdigest()[:16]}/{Path(path).name}"
         self.contents[place] = data
@@ -198,6 +198,6 @@ def _processors() -> int:
     """How many processors Ray has given to this runner; 1 where Ray says nothing."""
     if not ray.is_initialized():
         return 1
-    with Ignoring(Exception):  # the driver has no resources of its own
+    with suppress(Exception):  # the driver has no resources of its own
         return max(1, int(ray.get_runtime_context().get_assigned_resources().get("CPU", 1)))
     return 1

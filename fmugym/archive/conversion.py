@@ -20,7 +20,6 @@ from fmugym.archive.description import (
 )
 from fmugym.archive.variable import CLOCK_KINDS, MOST_FRACTIONS, UNKNOWN, Interval, Variable
 from fmugym.errors import FMULoadError, reason
-from fmugym.signals import ordinary
 
 __all__ = ["convert"]
 
@@ -429,5 +428,5 @@ def _unused_times(source: Any, attributes: tuple[str, ...]) -> tuple[str, ...]:
 def _broken_rules(source: Any) -> tuple[str, ...]:
     try:
         return tuple(validate_model_description(source))
-    except ordinary(Exception) as error:  # the validation itself stumbles over some invalid files
+    except Exception as error:  # the validation itself stumbles over some invalid files
         return (f"the model description could not be validated: {reason(error)}",)

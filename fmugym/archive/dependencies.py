@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -17,7 +18,6 @@ from typing import Final, NamedTuple
 from fmugym.archive import loader
 from fmugym.archive.elf import opened
 from fmugym.errors import FMULoadError
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "ask_in_a_child",
@@ -87,7 +87,7 @@ def ask_in_a_child(names: Sequence[str]) -> list[str]:
     """
     if not names:
         return []
-    with Ignoring(OSError, ValueError, subprocess.SubprocessError):
+    with suppress(OSError, ValueError, subprocess.SubprocessError):
         done = subprocess.run(
             [sys.executable, "-I", "-S", loader.__file__],
             input=json.dumps(list(names)).encode(),
@@ -172,7 +172,7 @@ def load_globally(path: str) -> None:
     """
     try:
         ctypes.CDLL(path, mode=getattr(os, "RTLD_GLOBAL", ctypes.DEFAULT_MODE))
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise FMULoadError(f"the library {path!r} cannot be loaded: {error}") from None
 
 

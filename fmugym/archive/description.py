@@ -17,7 +17,6 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.checks import Spellings, integer_of
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.signals import ordinary
 
 __all__ = [
     "BASE_UNITS",
@@ -265,7 +264,7 @@ class ModelDescription:
         """
         try:
             return self.variables[name]
-        except ordinary(Exception):  # a KeyError; or something that is no key at all
+        except Exception:  # a KeyError; or something that is no key at all
             known = list(self.variables)
         spelt = self._spelt(name)
         if spelt is not None:

@@ -43,7 +43,6 @@ from fmugym.archive.variable import Variable
 from fmugym.caching import is_own
 from fmugym.checks import KnownArguments, check_mapping, check_number, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, plain, printable, shown, warn_once
-from fmugym.signals import ordinary
 from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
 __all__ = [
@@ -574,7 +573,7 @@ def _copy_library(fmu: FMU, folder: Path, library: Path, count: int) -> list[Pat
                 fmu.extractions += 1
                 shutil.copytree(folder / library.parent, copy, dirs_exist_ok=True)
             paths.append(copy / library.name)
-    except ordinary(OSError, shutil.Error) as error:
+    except (OSError, shutil.Error) as error:
         raise FMULoadError(
             f"{library.name} needs a copy for each instance, but copy {len(paths) + 1} of {count} "
             f"failed: {error}; use fewer instances, or one process for each"
@@ -619,7 +618,7 @@ def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
     """A bare name is left to the system's loader."""
     try:
         paths = [] if isinstance(libraries, str) else [_file_name(one) for one in libraries]
-    except ordinary(Exception):  # a TypeError; or an object whose own methods fail
+    except Exception:  # a TypeError; or an object whose own methods fail
         paths = []
     if not paths and not (isinstance(libraries, list | tuple) and len(libraries) == 0):
         raise ConfigError(f"preload must be a list of paths, got {shown(libraries)}")

@@ -24,7 +24,6 @@ import fmpy
 from fmugym.archive.description import Capabilities, ModelDescription, ModelExchange, Unit
 from fmugym.archive.variable import UNKNOWN, Interval, Variable
 from fmugym.caching import cache_folder, read_file, replace_file
-from fmugym.signals import ordinary
 
 __all__ = ["keep", "kept"]
 
@@ -58,7 +57,7 @@ def kept(key: str) -> ModelDescription | None:
             return None
         text = zlib.decompressobj().decompress(packed, _LARGEST)
         return _description_of(json.loads(text))
-    except ordinary(Exception):  # whatever a file may hold
+    except Exception:  # whatever a file may hold
         return None
 
 
@@ -68,7 +67,7 @@ def keep(key: str, description: ModelDescription) -> None:
         packed = zlib.compress(json.dumps(_plain(description)).encode(), 1)
         path = cache_folder(_FOLDER) / _name(key)
         replace_file(path, hashlib.sha256(packed).digest() + packed)
-    except ordinary(OSError, RecursionError) as error:
+    except (OSError, RecursionError) as error:
         logger.debug("the model description is not kept: %s", error)
 
 

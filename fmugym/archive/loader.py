@@ -33,8 +33,6 @@ def _missing(name: str) -> list[str]:
     try:
         ctypes.CDLL(name)
     except OSError as error:
-        if type(error) is not OSError:  # a signal handler has raised it
-            raise
         missing, _, reason = str(error).partition(": ")
         return [missing if reason.startswith("cannot open shared object file") else name]
     return []

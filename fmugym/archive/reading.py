@@ -23,7 +23,6 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.kept import keep, kept
 from fmugym.archive.safe_zip import SafeZip, check_limit
 from fmugym.errors import FMULoadError, reason
-from fmugym.signals import ordinary
 
 __all__ = ["parse_xml", "read_model_description", "read_root", "read_xml"]
 
@@ -101,7 +100,7 @@ def _read(archive: SafeZip, content: bytes, interface: str | None) -> ModelDescr
         return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
         raise FMULoadError(f"{name}: {error}") from None
-    except ordinary(Exception) as error:  # FMPy leaks a dozen types for malformed files
+    except Exception as error:  # FMPy leaks a dozen types for malformed files
         raise FMULoadError(
             f"{name}: {_XML} cannot be understood: {type(error).__name__}: {reason(error)}"
         ) from error

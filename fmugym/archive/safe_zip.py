@@ -27,7 +27,6 @@ from typing import BinaryIO, Final, cast
 from fmugym.checks import KnownArguments, require_regular
 from fmugym.errors import FMULoadError, nearest_name, reason
 from fmugym.keys import LARGE_COUNT, check_fields, key
-from fmugym.signals import ordinary
 
 __all__ = ["ArchiveLimits", "SafeZip", "check_limit"]
 
@@ -120,7 +119,7 @@ class SafeZip:
             require_regular(path)
             self._version = _version_of(path)
             entries = _read_directory(path, limits)
-        except ordinary(*_ZIP_ERRORS) as error:
+        except _ZIP_ERRORS as error:
             raise FMULoadError(
                 f"{path.name} is not an FMU (a zip archive): {reason(error)}"
             ) from None
@@ -309,9 +308,9 @@ class SafeZip:
                 )
             with zipfile.ZipFile(self.path) as archive:
                 yield archive
-        except ordinary(OSError) as error:
+        except OSError as error:
             raise FMULoadError(f"{self.path.name} cannot be unpacked: {reason(error)}") from None
-        except ordinary(*_ZIP_ERRORS) as error:
+        except _ZIP_ERRORS as error:
             raise FMULoadError(
                 f"{self.path.name} is damaged: {reason(error)}; copy or export the FMU again"
             ) from None

@@ -9,12 +9,12 @@ import secrets
 import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from fmugym.caching import own_prefix, sweep
 from fmugym.errors import FMULoadError
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["folder_name", "is_plain", "make_folder", "remove_folder", "remove_rest"]
 
@@ -46,7 +46,7 @@ def folder_name() -> Path:
         root = _root()
         sweep(root)
         return root / f"{own_prefix()}{secrets.token_hex(8)}"
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
 
 
@@ -81,9 +81,9 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(0o700)
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
-    with Ignoring(OSError):
+    with suppress(OSError):
         _made_in[folder] = os.getcwd()
 
 
@@ -107,7 +107,7 @@ def _is_own(owner: int) -> bool:
 
 def _remove(folder: Path) -> None:
     _leave(folder, _made_in.get(folder, tempfile.gettempdir()))
-    with Ignoring(OSError):  # an exception of a signal handler comes out, even a TimeoutError
+    with suppress(OSError):
         shutil.rmtree(folder)
     if folder.exists():  # something cannot be removed, such as a library in use on Windows
         shutil.rmtree(folder, ignore_errors=True)
@@ -115,7 +115,7 @@ def _remove(folder: Path) -> None:
 
 
 def _leave(folder: Path, directory: str) -> None:
-    with Ignoring(OSError):
+    with suppress(OSError):
         if Path.cwd().is_relative_to(folder.resolve()):
             os.chdir(directory)
 

@@ -12,7 +12,6 @@ from typing import Any, Final, TypeVar
 from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 
 __all__ = [
     "IDENTITY",
@@ -218,7 +217,7 @@ def _parsed(name: str) -> Any:
         if not _HARMLESS.fullmatch(_EXPONENT.sub(" ", text)):
             raise ValueError(text)
         return _pint()[1].Unit(text)
-    except ordinary(Exception) as error:  # pint passes on errors of the parsers that it uses
+    except Exception as error:  # pint passes on errors of the parsers that it uses
         raise ConfigError(
             f"{shown(name)} is no unit that is known; write units as FMI ('W/(m2.K)') or Pint does"
         ) from error

@@ -21,7 +21,6 @@ from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.linearization import LinearModel
 from fmugym.linearization.trajectories import discrete
-from fmugym.signals import ordinary
 
 __all__ = ["LQR", "PID", "Hysteresis", "Law"]
 
@@ -203,7 +202,7 @@ class LQR(Controller):
         try:
             cost = linalg.solve_discrete_are(a, b, self._q, self._r)
             self.gain = np.linalg.solve(self._r + b.T @ cost @ b, b.T @ cost @ a)
-        except ordinary(ValueError, np.linalg.LinAlgError) as error:
+        except (ValueError, np.linalg.LinAlgError) as error:
             raise ConfigError(f"no regulator stabilizes this model: {error}") from None
         if np.abs(np.linalg.eigvals(a - b @ self.gain)).max() >= 1:
             raise ConfigError("no regulator stabilizes this model; do its inputs move its states?")

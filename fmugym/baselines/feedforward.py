@@ -12,7 +12,6 @@ import numpy.typing as npt
 from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 
 __all__ = ["Constant", "Random", "Schedule"]
 
@@ -33,7 +32,7 @@ class Constant(Controller):
         try:
             taken = self._as_actions(self._decide(np.empty((1, 0))))[0]
             is_element = np.allclose(taken, self.action)  # but for its rounding to float32
-        except ordinary(TypeError, ValueError):  # of another shape, or no numbers
+        except (TypeError, ValueError):  # of another shape, or no numbers
             is_element = False
         if not is_element:
             raise ConfigError(f"the action {shown(self.action)} is not in {shown(self.space)}")

@@ -16,7 +16,6 @@ from fmugym.declared.data_tables import Column, Table
 from fmugym.declared.weather import read_modelica, read_weather
 from fmugym.errors import ConfigError, reading, reason, shown
 from fmugym.extras import imported
-from fmugym.signals import ordinary
 
 __all__ = ["read_tables"]
 
@@ -48,7 +47,7 @@ def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Table]:
             _column_of_arrow(path.name, name, column)
             for name, column in zip(table.column_names, table.columns, strict=True)
         ]
-    except ordinary(pyarrow.ArrowException, ValueError) as error:
+    except (pyarrow.ArrowException, ValueError) as error:
         raise ConfigError(f"{path.name} is no Parquet file: {reason(error)}") from None
     if not table.num_rows:
         raise ConfigError(f"{path.name} has no rows")

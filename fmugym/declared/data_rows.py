@@ -18,7 +18,6 @@ from fmugym.declared.data_tables import Column, Table
 from fmugym.declared.dates import CURE, DAY, HOUR, REGULAR, Dates, FloatArray
 from fmugym.declared.entries import Entry
 from fmugym.errors import ConfigError, missing_file, shown, unknown_name
-from fmugym.signals import ordinary
 
 __all__ = ["Rows", "offsets_of", "read_rows", "usual_distance"]
 
@@ -291,7 +290,7 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
             return read_tables(path)
     except FileNotFoundError:
         raise file.error(missing_file("file", path, f"*{path.suffix}")) from None
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
 

@@ -10,7 +10,6 @@ from fmugym.checks import require_regular
 from fmugym.declared.entries import Entry
 from fmugym.distributions import Column
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 
 __all__ = ["read_fitted"]
 
@@ -35,7 +34,7 @@ def read_fitted(entry: Entry) -> dict[str, Column]:
                 names, rows = np.atleast_1d(file["names"]).tolist(), file["rows"]
         except FileNotFoundError:
             raise ConfigError(f"there is no file {shown(str(path))}") from None
-        except ordinary(OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
+        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
             raise _not_fitted(path) from None
         is_table = rows.ndim == 2 and rows.dtype.kind == "f" and rows.shape[1] == len(names)
         if not (is_table and rows.size and np.isfinite(rows).all()):

@@ -15,7 +15,6 @@ from fmugym.declared.task import Task
 from fmugym.declared.task_env import TaskEnv
 from fmugym.env import FMUEnv
 from fmugym.errors import ArgumentError, reason, shown, unknown_name
-from fmugym.signals import ordinary
 
 __all__ = ["load"]
 
@@ -89,7 +88,7 @@ def _imported(entry: Entry) -> Any:
             raise entry.error(f"{shown(module)} cannot be imported: {error}") from error
         near = unknown_name("module", module, (path.stem for path in sorted(Path().glob("*.py"))))
         raise entry.error(f"{near} (looked in {shown(str(Path.cwd()))}, too)") from None
-    except ordinary(Exception) as error:  # a module may do anything
+    except Exception as error:  # a module may do anything
         what = f"{type(error).__name__}: {reason(error)}"
         raise entry.error(f"{shown(module)} cannot be imported: {what}") from error
     if not hasattr(found, name):

@@ -24,7 +24,6 @@ from fmugym.declared.writing import as_toml, revised, write_new
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
 from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
-from fmugym.signals import ordinary
 
 __all__ = ["Task"]
 
@@ -274,7 +273,7 @@ def _read(path: Path) -> Source:
         raise ConfigError(f"{shown(str(path))} is no TOML file: {_advice(path)}") from None
     except FileNotFoundError:
         raise missing_file("task file", path, "*.toml") from None
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     document = _parsed(path, text)
     source = Source(path, path.parent, text, _with_paths(_plain(document), path.parent))

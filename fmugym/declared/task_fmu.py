@@ -16,7 +16,6 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, TaskError, missing_file
 from fmugym.keys import table_of
-from fmugym.signals import ordinary
 from fmugym.systems import Component, FMUSystem
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
@@ -212,7 +211,7 @@ def _state(entry: Entry, path: Path) -> _State:
     try:
         status = path.stat()
         return path, status.st_mtime_ns, status.st_size
-    except ordinary(OSError, ValueError):  # there is none, or no file could have such a name
+    except (OSError, ValueError):  # there is none, or no file could have such a name
         raise entry.error(missing_file("FMU", path, f"*{path.suffix or '.fmu'}")) from None
 
 

@@ -10,7 +10,6 @@ from typing import Any, Final
 
 from fmugym.errors import ConfigError, shown
 from fmugym.files import write_whole
-from fmugym.signals import ordinary
 
 __all__ = ["as_toml", "revised", "write_new"]
 
@@ -91,7 +90,7 @@ def revised(text: str, document: Mapping[str, Any]) -> str | None:
         _revise(written, document, ())
         changed = tomlkit.dumps(written)
         return changed if _same(tomllib.loads(changed), document) else None
-    except ordinary(TOMLKitError, KeyError, ValueError):
+    except (TOMLKitError, KeyError, ValueError):
         return None
 
 

@@ -21,7 +21,6 @@ from fmugym.errors import plain
 from fmugym.extras import imported
 from fmugym.files import replaced
 from fmugym.series.intervals import confidence
-from fmugym.signals import ordinary
 
 __all__ = [
     "HELD_OUT_SEED",
@@ -164,7 +163,7 @@ def _leaving_out(name: str, leave_out: Callable[[str, Exception], None] | None) 
     """Tell of an error in a block, if somebody wants to know, instead of raising it."""
     try:
         yield
-    except ordinary(Exception) as error:
+    except Exception as error:
         if leave_out is None:
             raise
         leave_out(name, error)

@@ -24,8 +24,7 @@ class Status(enum.IntEnum):
 
 WARNING_CODE: Final = int(Status.WARNING)
 TERMINATED_CODE: Final = int(Status.TERMINATED)
-"""What arrays of statuses are compared with. Numpy asks the class of an enumeration for attributes,
-and drops what a signal handler raises meanwhile."""
+"""Statuses for comparisons with arrays, as numbers: numpy is slow with members of enumerations."""
 
 
 def sane(status: int) -> int:

@@ -13,7 +13,6 @@ from fmugym.identification.comparison import Comparison
 from fmugym.identification.output_error import FitResult, fit_of
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
-from fmugym.signals import ordinary
 
 __all__ = ["Shift", "shift_of_clocks"]
 
@@ -81,7 +80,7 @@ def shift_of_clocks(
         step = seconds - last
         try:
             found = _fitted(fit, found, trajectories, seconds, max_evaluations)
-        except ordinary(ConfigError, SimulationError):  # too few rows are left, or the FMU fails
+        except (ConfigError, SimulationError):  # too few rows are left, or the FMU fails
             return None
     ratio = _size(found.comparison) / _size(fit.comparison)
     if not seconds or not ratio < _BETTER:

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from fmugym.checks import check_mapping, check_number, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.signals import ordinary
 
 __all__ = ["Trajectory", "common_names"]
 
@@ -66,7 +65,7 @@ class Trajectory:
         """
         try:
             rows = np.arange(len(self))[chosen]
-        except ordinary(Exception):  # objects may do anything when numpy looks at them
+        except Exception:  # objects may do anything when numpy looks at them
             raise ConfigError(f"samples cannot be selected by {shown(chosen)}") from None
         outputs = {name: values[rows] for name, values in self.outputs.items()}
         inputs = {name: values[rows] for name, values in self.inputs.items()}
@@ -147,7 +146,7 @@ def _samples(name: str, values: npt.ArrayLike, count: int | None) -> FloatArray:
         if raw.dtype.kind not in "biufO":  # numpy would convert texts and complex numbers
             raise TypeError
         array = np.array(raw, np.float64)
-    except ordinary(Exception):  # objects may do anything when numpy looks at them
+    except Exception:  # objects may do anything when numpy looks at them
         raise ConfigError(f"{what} must be numbers, not {shown(values)}") from None
     if not np.isfinite(array).all():
         raise ConfigError(f"{what} must be finite")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +23,6 @@ from fmugym.errors import ConfigError, shown
 from fmugym.plant.polling import Answer, CertificateError, Values
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
-from fmugym.signals import Ignoring
 
 __all__ = ["PlantClient", "serve"]
 
@@ -56,7 +55,7 @@ class PlantClient:
             await self._client.connect()
             yield
         finally:
-            with Ignoring(Exception):  # there may be nobody to say goodbye to
+            with suppress(Exception):  # there may be nobody to say goodbye to
                 await self._client.disconnect()
 
     async def _secure(self, certificate: Path, key: Path) -> None:

@@ -14,7 +14,6 @@ from fmugym.extras import imported
 from fmugym.plant.background import Background
 from fmugym.plant.tags import Plant, Tag
 from fmugym.pool.backend.clocks import Clock, speed_of
-from fmugym.signals import ordinary
 
 __all__ = [
     "Answer",
@@ -126,9 +125,9 @@ class Poller:
             async with AsyncExitStack() as connection:
                 try:
                     await self._converse(connection)
-                except ordinary(TimeoutError):
+                except TimeoutError:
                     self._trouble = f"it does not answer within {self._timeout:g} s"
-                except ordinary(Exception) as error:  # whatever a library makes of a broken line
+                except Exception as error:  # whatever a library makes of a broken line
                     self._note(error)
             await asyncio.sleep(self._interval / self._speed)
 

@@ -8,7 +8,6 @@ from typing import Final
 
 from fmugym.checks import check_path, require_regular
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 
 __all__ = ["credentials", "require_secret"]
 
@@ -26,7 +25,7 @@ def require_secret(path: Path) -> None:
     try:
         require_regular(path)
         mode = path.stat().st_mode & 0o777
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     if os.name == "posix" and mode & _OTHERS:
         raise ConfigError(

@@ -48,7 +48,6 @@ from fmugym.pool.requests import (
     request_save_states,
 )
 from fmugym.pool.saving_pool import keeps_records
-from fmugym.signals import ordinary
 
 __all__ = ["NativePool", "prepare"]
 
@@ -146,7 +145,7 @@ class NativePool(AskingPool):
         arrays = self.inputs, self.outputs, self.statuses, self.observations, self._counts
         try:
             return _native.Pool(form, arrays, Receiver(log, description), fmu.calls_python())
-        except ordinary(OSError) as error:
+        except OSError as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error), fmu.extract())) from None
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:

@@ -7,8 +7,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from fmugym.signals import ordinary
-
 __all__ = ["available_processors", "processor_quota"]
 
 
@@ -74,7 +72,7 @@ def _ratio(quota: str, period: str) -> float:
     """What both are worth; no limit if they are not positive numbers, as ``max`` and ``-1``."""
     try:
         values = int(quota), int(period)
-    except ordinary(ValueError):
+    except ValueError:
         return math.inf
     return values[0] / values[1] if min(values) > 0 else math.inf
 
@@ -82,5 +80,5 @@ def _ratio(quota: str, period: str) -> float:
 def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip()
-    except ordinary(OSError):
+    except OSError:
         return ""

@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from fmugym.caching import read_file, replace_file
 from fmugym.pool.spec import PoolSpec
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["MOST_BYTES", "StateFiles", "essence"]
 
@@ -51,7 +51,7 @@ class StateFiles:
         try:
             state = _parsed(read_file(path, _LARGEST))
             os.utime(path)
-        except ordinary(OSError):
+        except OSError:
             return None
         return state
 
@@ -63,7 +63,7 @@ class StateFiles:
             self._prefix.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             replace_file(self.path(key), _MAGIC + hashlib.sha256(state).digest() + state)
             _remove_old(self._prefix.parent)
-        except ordinary(OSError) as error:
+        except OSError as error:
             logger.debug("no state is kept: %s", error)
 
 
@@ -78,14 +78,14 @@ def _remove_old(folder: Path) -> None:
     """Remove the states that were not used for longest until the others are few enough."""
     files = []
     for path in folder.iterdir():
-        with Ignoring(OSError):  # another process has removed it
+        with suppress(OSError):  # another process has removed it
             status = path.lstat()
             files.append((status.st_mtime_ns, status.st_size, path))
     total = 0
     for _, size, path in sorted(files, reverse=True):
         total += size
         if total > MOST_BYTES:
-            with Ignoring(OSError):
+            with suppress(OSError):
                 path.unlink()
 
 

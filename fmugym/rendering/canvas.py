@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from fmugym.checks import check_integer, check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering._pygame import pygame
-from fmugym.signals import ordinary
 
 Color: TypeAlias = tuple[int, int, int]
 Point: TypeAlias = tuple[float, float]
@@ -36,7 +35,7 @@ def _drawing(method: _CallT) -> _CallT:
             return method(self, *arguments, **options)
         except ConfigError:
             raise
-        except ordinary(Exception) as error:  # objects may do anything when they are converted
+        except Exception as error:  # objects may do anything when they are converted
             what = shown((*arguments, options))
             raise ConfigError(
                 f"Canvas.{method.__name__} cannot draw {what}: {shown(error)}"

@@ -8,7 +8,6 @@ from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas, Point, World, direction
-from fmugym.signals import ordinary
 
 _LARGEST_FORCE: Final = 1.6  # of the drawn force, as a multiple of `force_scale`
 _LARGEST_SWEEP: Final = math.radians(150.0)  # of the torque arrow at the torque limit
@@ -209,6 +208,6 @@ def _numbers(frame: object, *names: str) -> list[float]:
     """Return numbers of a frame, which may be NaN or infinite."""
     try:
         return [float(getattr(frame, name)) for name in names]
-    except ordinary(Exception):  # a frame may be any object
+    except Exception:  # a frame may be any object
         wanted = ", ".join(names)
         raise ConfigError(f"a frame needs the numbers {wanted}: {shown(frame)}") from None

@@ -24,7 +24,6 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.reading import read_xml
 from fmugym.archive.safe_zip import SafeZip
 from fmugym.errors import ConfigError, FMULoadError, reason
-from fmugym.signals import ordinary
 
 __all__ = ["compile_fmu"]
 
@@ -75,7 +74,7 @@ def _source_files(fmu: FMU, folder: Path) -> Any:
     try:
         listed = read_build_description(folder, validate=False)
         listed += fmpy.read_model_description(folder, validate=False).buildConfigurations
-    except ordinary(Exception) as error:  # FMPy leaks a dozen types for malformed files
+    except Exception as error:  # FMPy leaks a dozen types for malformed files
         raise _refusal(fmu, f"its source files are not known: {reason(error)}") from None
     identifier = fmu.description.model_identifier
     sets = [one.sourceFileSets for one in listed if one.modelIdentifier == identifier]
@@ -152,7 +151,7 @@ def _write(folder: Path, output: Path) -> None:
             create_zip_archive(file, folder)
     except FileExistsError:
         raise ConfigError(f"{output} exists already") from None
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise ConfigError(f"{output} cannot be written: {reason(error)}") from None
     except BaseException:
         output.unlink(missing_ok=True)

@@ -22,7 +22,6 @@ from fmugym.archive.elf import opened
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError
 from fmugym.extras import c_compiler
-from fmugym.signals import ordinary
 
 __all__ = ["LIBRARIES", "StandIn", "build_stand_in", "replaceable"]
 
@@ -78,7 +77,7 @@ def build_stand_in(fmu: FMU, folder: Path) -> tuple[StandIn, ...]:
             raise ConfigError(f"{path} exists already")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise ConfigError(f"{folder} cannot hold libraries: {error}") from None
     return tuple(_build(fmu, path) for path in paths)
 

@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +31,6 @@ from fmugym.checks import (
 from fmugym.errors import ConfigError, reading, shown
 from fmugym.files import write_whole
 from fmugym.search.flattening import choices_of, rows_of
-from fmugym.signals import Ignoring
 
 __all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
 
@@ -78,7 +78,7 @@ def _text(what: str, value: Any) -> str | None:
 
 
 def _numbers(what: str, value: Any) -> FloatArray:
-    with Ignoring(ValueError, OverflowError):  # lists of different lengths, numbers too large
+    with suppress(ValueError, OverflowError):  # lists of different lengths, numbers too large
         array = np.array(value)
         if not array.size or array.dtype.kind in "iuf":
             return array.astype(np.float64)

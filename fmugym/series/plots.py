@@ -20,7 +20,6 @@ from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.files import replaced
 from fmugym.series.timeseries import TimeSeries
-from fmugym.signals import ordinary
 from fmugym.task.quantity import Quantity
 
 __all__ = ["COLOURS", "as_svg", "drawing_style", "plot", "svg_of"]
@@ -130,7 +129,7 @@ def plot(series: TimeSeries, path: str | os.PathLike[str] | None = None, title: 
         try:
             with replaced(file) as part:
                 figure.savefig(part, dpi=150)
-        except ordinary(ValueError) as error:  # of Matplotlib, for a format that it does not know
+        except ValueError as error:  # of Matplotlib, for a format that it does not know
             raise ConfigError(f"no picture can be written: {error}") from None
     return figure
 

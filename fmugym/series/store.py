@@ -6,13 +6,13 @@ import csv
 import json
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
-from fmugym.signals import Ignoring, ordinary
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 
 __all__ = [
@@ -117,8 +117,8 @@ class CsvStore:
             self._writer.writerow([*cells, rows.faults.get(number, "")])
         try:
             self._file.flush()
-        except ordinary(OSError) as error:  # a full disk: what is in the file stays
-            with Ignoring(OSError):
+        except OSError as error:  # a full disk: what is in the file stays
+            with suppress(OSError):
                 self._file.close()
             error.filename = str(self._path)
             raise

@@ -17,7 +17,6 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
 from fmugym.series.store import FAULT, WHOLE, open_store
-from fmugym.signals import ordinary
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 
 __all__ = ["TimeSeries"]
@@ -133,7 +132,7 @@ class TimeSeries:
             columns = [Quantity(**json.loads(one.metadata[b"quantity"])) for one in fields]
         except FileNotFoundError:
             raise
-        except ordinary(Exception) as error:  # a damaged file may raise anything
+        except Exception as error:  # a damaged file may raise anything
             raise ConfigError(f"{shown(str(file))} is no recording: {error}") from None
         texts: dict[float, str] = {}
         values = [_read_column(table.column(column.name), column, texts) for column in columns]

@@ -14,7 +14,6 @@ from gymnasium import spaces
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMUGymError, shown
-from fmugym.signals import ordinary
 from fmugym.task.spaces import to_input_types
 
 __all__ = ["elements_of", "flat_inputs", "no_action", "take_action"]
@@ -118,7 +117,7 @@ def _of_shape(action: Any, space: spaces.Space[Any]) -> Any:
         return array.reshape(shape)
     except FMUGymError:
         raise
-    except ordinary(Exception):  # lists of different lengths, or objects whose methods fail
+    except Exception:  # lists of different lengths, or objects whose methods fail
         raise ConfigError(
             f"action {shown(action)} is not in {space}: expected numbers of shape {shape}"
         ) from None
@@ -137,7 +136,7 @@ def _is_element(action: Any, elements: Collection[int]) -> bool:
     """Whether an action is one of the elements of a ``Discrete``."""
     try:
         return operator.index(action) in elements
-    except ordinary(Exception):  # a TypeError, or whatever the object's method raises
+    except Exception:  # a TypeError, or whatever the object's method raises
         return False
 
 
@@ -151,7 +150,7 @@ def _has_nan(action: Any) -> bool:
         return False
     try:
         return any(map(_has_nan, action.values() if isinstance(action, Mapping) else action))
-    except ordinary(Exception):  # a list that contains itself, or an object whose methods fail
+    except Exception:  # a list that contains itself, or an object whose methods fail
         return False
 
 
@@ -167,7 +166,7 @@ def _is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
             if space.contains(action):
                 return False
         is_numeric = np.asarray(action).dtype.kind in "biuf"
-    except ordinary(Exception):  # an object whose methods fail
+    except Exception:  # an object whose methods fail
         return True
     return not is_numeric or isinstance(error, _OF_MISFITS)
 
@@ -201,7 +200,7 @@ def flat_inputs(
     try:
         raw = np.asarray(values)
         flat = raw.astype(np.float64, casting="unsafe" if raw.dtype == object else "same_kind")
-    except ordinary(Exception):  # not numbers, too large, or objects whose methods fail
+    except Exception:  # not numbers, too large, or objects whose methods fail
         raise ConfigError(f"{source(values)} does not make numbers") from None
     flat = flat.ravel()
     if flat.size != len(variables):

@@ -22,7 +22,6 @@ from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, support_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name, warn_once
 from fmugym.pool import Pool, PoolSpec
-from fmugym.signals import ordinary
 from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
@@ -334,7 +333,7 @@ def _require_readings(cls: type[Any]) -> None:
 def _set_level(logger: logging.Logger, level: Any) -> None:
     try:
         logger.setLevel(level)
-    except ordinary(Exception):  # a TypeError or ValueError; or the object's own method fails
+    except Exception:  # a TypeError or ValueError; or the object's own method fails
         raise ConfigError(f"log_level must be a level of logging, got {shown(level)}") from None
 
 

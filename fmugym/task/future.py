@@ -10,7 +10,6 @@ import numpy as np
 
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray
-from fmugym.signals import ordinary
 
 __all__ = ["Future", "Lookup", "assumed"]
 
@@ -69,7 +68,7 @@ class Lookup(NamedTuple):
         """
         try:
             times, values = (np.asarray(part, np.float64) for part in rows)
-        except ordinary(Exception):  # no pair, or no numbers
+        except Exception:  # no pair, or no numbers
             times = values = np.empty((0, 0))
         if times.ndim != 1 or times.shape != values.shape or not len(times):
             raise ConfigError(

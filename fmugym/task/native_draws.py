@@ -14,7 +14,6 @@ import numpy as np
 from fmugym.distributions import Recipe
 from fmugym.pool import has_native_pool
 from fmugym.pool.form import form_of_draws
-from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
     from fmugym._native import Draws
@@ -79,6 +78,6 @@ def _exponential() -> int:
 def _address(library: str | None, name: str) -> int:
     try:
         function = getattr(ctypes.CDLL(library), name)
-    except ordinary(AttributeError, OSError):  # the system does not export it
+    except (AttributeError, OSError):  # the system does not export it
         return 0
     return ctypes.cast(function, ctypes.c_void_p).value or 0

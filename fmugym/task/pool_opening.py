@@ -21,7 +21,6 @@ from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
-from fmugym.signals import ordinary
 from fmugym.systems import FMUSystem
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.starting import structural_values
@@ -234,7 +233,7 @@ def _find_file(cls: type, path: Path) -> Path:
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except ordinary(OSError):  # the path is not valid for any file
+    except OSError:  # the path is not valid for any file
         return False
 
 
@@ -243,5 +242,5 @@ def _has_file(cls: type) -> bool:
         return False
     try:
         return Path(inspect.getfile(cls)).is_file()
-    except ordinary(TypeError, OSError):
+    except (TypeError, OSError):
         return False

@@ -15,7 +15,6 @@ from gymnasium import spaces
 
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 
 __all__ = [
     "FLOAT32_LIMIT",
@@ -145,7 +144,7 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
         try:
             fits = observation.keys() == parts.keys()
-        except ordinary(Exception):  # not a mapping, or its methods fail
+        except Exception:  # not a mapping, or its methods fail
             fits = False
         if not fits:
             raise ConfigError(
@@ -200,7 +199,7 @@ def _numbers(observation: Any) -> np.ndarray[Any, Any]:
     given(observation, _OBSERVE)
     try:
         array = np.asarray(observation)
-    except ordinary(Exception):  # ragged lists, or objects whose methods fail
+    except Exception:  # ragged lists, or objects whose methods fail
         array = np.asarray(None)
     if array.dtype.kind not in "fiub":
         raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, expected an array of numbers")

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
     from fmugym.task.construction import Constructed
@@ -97,7 +96,7 @@ class Snapshot:
     def _places(self, which: Any) -> IndexArray:
         try:
             places = np.atleast_1d(np.arange(len(self))[which])
-        except ordinary(Exception):  # numpy refuses it, or the caller's object fails
+        except Exception:  # numpy refuses it, or the caller's object fails
             places = np.empty((0, 0))
         if places.ndim > 1:
             raise ConfigError(f"{shown(which)} are no environments of a snapshot of {len(self)}")

@@ -12,7 +12,6 @@ import numpy as np
 from fmugym.archive.texts import texts_of
 from fmugym.checks import Spellings
 from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_name
-from fmugym.signals import ordinary
 
 __all__ = [
     "EpisodeVariables",
@@ -81,7 +80,7 @@ class NamedValues(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         try:
             index = self._index[name]
-        except ordinary(Exception):  # a KeyError, or an object that cannot be a key
+        except Exception:  # a KeyError, or an object that cannot be a key
             return self._array(name)
         return self._get_values()[index]
 
@@ -217,7 +216,7 @@ class EpisodeVariables(dict[str, Any]):
         """Write several variables, as in a dict. If a name is unknown, nothing is written."""
         try:
             new = dict(*args, **kwargs)
-        except ordinary(Exception):  # not a dict, or a dict whose methods fail
+        except Exception:  # not a dict, or a dict whose methods fail
             raise ConfigError(f"{shown(args)} are no values by name") from None
         super().update({self._spelt(name): value for name, value in new.items()})
 

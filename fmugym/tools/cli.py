@@ -84,7 +84,6 @@ from typing import Any, Final, NoReturn
 import argcomplete
 
 from fmugym.errors import FMUGymError, unknown_name
-from fmugym.signals import ordinary
 from fmugym.tools.demo import add_demo
 from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
@@ -144,7 +143,7 @@ def _code_of(arguments: argparse.Namespace) -> int:
         return exit_code(error)
     except BrokenPipeError:  # the reader, for example ``head``, has ended
         drop_output()
-    except ordinary(FMUGymError, OSError) as error:
+    except (FMUGymError, OSError) as error:
         for line in _told(error).splitlines():  # a task may have several mistakes
             note(line, "error")
         return 1 if (end := _end_before(error)) is None else exit_code(end)

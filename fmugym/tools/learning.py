@@ -16,7 +16,6 @@ from fmugym.checks import check_number
 from fmugym.episodes.evaluation import Score, table
 from fmugym.episodes.output_files import title_of
 from fmugym.errors import ConfigError
-from fmugym.signals import ordinary
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -143,7 +142,7 @@ def _train(arguments: argparse.Namespace) -> None:
         _refuse(arguments, _OF_SEARCHES, "is for searches, without --algorithm")
     try:
         _search(arguments) if is_search else _learn(arguments)
-    except ordinary(OSError) as error:  # what writes to open files does not say where
+    except OSError as error:  # what writes to open files does not say where
         error.filename = error.filename or str(arguments.output)
         raise
 

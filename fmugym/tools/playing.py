@@ -15,7 +15,6 @@ from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import ConfigError, plain, reason
-from fmugym.signals import ordinary
 from fmugym.tools.datasets import (
     add_of_datasets,
     add_timezone,
@@ -230,7 +229,7 @@ class LeftOut:
         """Leave one out who fails in a block."""
         try:
             yield
-        except ordinary(Exception) as error:
+        except Exception as error:
             self.note(name, error)
 
     @property

@@ -8,10 +8,9 @@ import os
 import shutil
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
-
-from fmugym.signals import Ignoring
 
 __all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus", "named"]
 
@@ -29,7 +28,7 @@ def keep_output_from_fmus(*, shown: bool) -> BinaryIO | None:
     Returns:
         The file, which has no name, so that nothing is left of it after any end of the process.
     """
-    with Ignoring(OSError, AttributeError, io.UnsupportedOperation):
+    with suppress(OSError, AttributeError, io.UnsupportedOperation):
         if (sys.stdout.fileno(), sys.stderr.fileno()) != (1, 2):
             return None
         sys.stdout = _apart(sys.stdout)
@@ -58,7 +57,7 @@ def _apart(stream: Any) -> Any:
 
 def named(printed: BinaryIO) -> Path | None:
     """Give what FMUs have printed a file with a name; None if they have printed nothing."""
-    with Ignoring(OSError, AttributeError, TypeError):  # Windows has no such library
+    with suppress(OSError, AttributeError, TypeError):  # Windows has no such library
         ctypes.CDLL(None).fflush(None)
     if not printed.seek(0, os.SEEK_END):
         return None

@@ -24,7 +24,6 @@ from fmugym.extras import imported
 from fmugym.files import replaced_together
 from fmugym.scaling import are_scaled, unscaled
 from fmugym.search.policy import AGENT, Agent, require_task
-from fmugym.signals import ordinary
 
 __all__ = [
     "FACTS",
@@ -210,7 +209,7 @@ def read_facts(folder: Path, name: str, what_is_wrong: str, *needed: str) -> dic
         require_regular(folder / name)
         facts = json.loads((folder / name).read_text(encoding="utf-8"))
         return {**{one: facts[one] for one in needed}, **facts}
-    except ordinary(OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(f"{shown(str(folder))} {what_is_wrong}") from None
 
 

@@ -12,7 +12,6 @@ from fmugym.baselines.arena import Arena, Outcome
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.search.policy import Agent
 from fmugym.series.intervals import confidence
-from fmugym.signals import ordinary
 
 __all__ = ["judge", "verdict"]
 
@@ -46,7 +45,7 @@ def judge(
         with closing(arena):
             try:
                 arena.open(len(seeds))
-            except ordinary(Exception) as error:
+            except Exception as error:
                 leave_out(f"scenario {scenario}" if len(arenas) > 1 else scenario, error)
                 continue
             opened.append(scenario)
@@ -54,7 +53,7 @@ def judge(
                 arena.advance = lambda part, name=name: advance(name, part / len(arenas))  # type: ignore[misc]
                 try:
                     played[name].append(agents[name].play(arena, seeds))
-                except ordinary(Exception) as error:
+                except Exception as error:
                     leave_out(name, error)
                     del played[name]
                     arena.close()  # its episodes are in the middle of something

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -24,7 +24,6 @@ from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
 from fmugym.search.search_file import bytes_of, plain_of, search_in
-from fmugym.signals import Ignoring, ordinary
 from fmugym.training.agents import FACTS
 from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
@@ -124,7 +123,7 @@ class Searching:
                 winner = self._winner()
             return self._judged(winner)
         finally:
-            with Ignoring(OSError):  # something was found, so that the folder is not empty
+            with suppress(OSError):  # something was found, so that the folder is not empty
                 self.folder.rmdir()
 
     def _begun(self) -> Search:
@@ -338,7 +337,7 @@ class Searching:
                 agent = Agent(name, warmed(text, baseline))
                 with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
                     agent.play(arena, range(1))
-            except ordinary(Exception) as error:
+            except Exception as error:
                 self._leave_out(name, error)
                 continue
             seconds = arena.seconds / arena.steps * self._probe.most_steps * episodes

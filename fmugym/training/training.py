@@ -31,7 +31,6 @@ from fmugym.episodes.simulation import Player
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.files import write_whole
 from fmugym.scaling import can_be_scaled
-from fmugym.signals import ordinary
 from fmugym.training.agents import (
     FACTS,
     agent_player,
@@ -271,7 +270,7 @@ def _new_model(settings: TrainingSettings, venv: Any) -> Any:
     try:
         algorithm = algorithm_of(settings.algorithm)
         return algorithm(policy, venv, **{"seed": settings.seed, "device": "cpu", **own})
-    except ordinary(TypeError, ValueError, AssertionError) as error:
+    except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(f"{settings.algorithm} cannot be made: {reason(error)}") from error
 
 

@@ -20,7 +20,6 @@ from fmugym.caching import cache_folder, read_file, replace_file
 from fmugym.checks import check_option
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import PoolSpec
-from fmugym.signals import ordinary
 from fmugym.trial.verdict import Verdict
 
 __all__ = [
@@ -46,7 +45,7 @@ def recall(key: str) -> str | None:
     """Read the text that was kept under a key; None if there is none."""
     try:
         return read_file(cache_folder() / key, _LARGEST).decode()
-    except ordinary(OSError, ValueError):
+    except (OSError, ValueError):
         return None
 
 
@@ -54,7 +53,7 @@ def remember(key: str, text: str) -> None:
     """Keep a text under a key, which is a file name."""
     try:
         replace_file(cache_folder() / key, text.encode())
-    except ordinary(OSError) as error:
+    except OSError as error:
         logger.debug("nothing is remembered: %s", error)
 
 
@@ -75,7 +74,7 @@ def state_files(fmu: FMU) -> str:
     """Where states of an FMU are kept; see ``fmugym.pool.state_files``."""
     try:
         return str(cache_folder("states") / content_key(fmu))
-    except ordinary(OSError):  # there is no folder for caches
+    except OSError:  # there is no folder for caches
         return ""
 
 

@@ -9,7 +9,6 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 
 __all__ = ["array_of", "checked_actions", "is_array_space"]
 
@@ -59,7 +58,7 @@ def array_of(value: Any) -> npt.NDArray[Any]:
     """A new array of what a caller gave; an empty one of objects if it makes none."""
     try:
         return np.array(value)
-    except ordinary(Exception):  # lists that make no array, and the user's own __array__
+    except Exception:  # lists that make no array, and the user's own __array__
         return np.empty(0, object)
 
 

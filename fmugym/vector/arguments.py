@@ -18,7 +18,6 @@ from fmugym.checks import (
 )
 from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
-from fmugym.signals import ordinary
 from fmugym.vector.action_arrays import array_of
 
 __all__ = [
@@ -71,7 +70,7 @@ def checked_num_envs(value: Any) -> int:
 def _bytes_of_memory() -> int:
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except ordinary(AttributeError, ValueError, OSError):  # Windows
+    except (AttributeError, ValueError, OSError):  # Windows
         return 2**40
 
 
@@ -153,7 +152,7 @@ def _elements(values: Any) -> list[Any] | None:
         return None
     try:
         return list(values)
-    except ordinary(Exception):  # an array without a dimension, or the user's own __iter__
+    except Exception:  # an array without a dimension, or the user's own __iter__
         return None
 
 

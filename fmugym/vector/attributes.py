@@ -10,7 +10,6 @@ import numpy as np
 from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
-from fmugym.signals import ordinary
 from fmugym.task.construction import draws_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
@@ -90,7 +89,7 @@ class Attributes:
             return [values] * count
         try:
             each = list(values)
-        except ordinary(Exception):  # a list of the caller's whose methods fail
+        except Exception:  # a list of the caller's whose methods fail
             raise ConfigError(f"{shown(values)} are no values of {shown(name)}") from None
         if len(each) != count:
             raise ConfigError(f"there are {len(each)} values of {shown(name)}, expected {count}")

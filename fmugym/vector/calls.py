@@ -11,7 +11,6 @@ from typing import Any, Final
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.signals import ordinary
 from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.contents import Contents
@@ -49,7 +48,7 @@ def attribute(env: FMUEnv, name: str) -> Any:
         return env.parameters[name]
     try:
         return getattr(env, name)
-    except ordinary(AttributeError) as error:
+    except AttributeError as error:
         raise UnknownAttributeError(str(error)) from None
 
 

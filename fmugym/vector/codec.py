@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
-from fmugym.signals import ordinary
 
 __all__ = ["coded", "gathered", "handed_out", "mapped", "with_masks", "within"]
 
@@ -95,7 +94,7 @@ def _gathered_values(name: str, indices: list[int], own: list[Any], count: int) 
     for index, value in zip(indices, own, strict=True):
         try:
             values[index] = value
-        except ordinary(Exception):  # users' infos may raise anything
+        except Exception:  # users' infos may raise anything
             raise _misfit(name, index, value) from None
     return values
 

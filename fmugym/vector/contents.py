@@ -7,7 +7,7 @@ import random
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import PurePath
 from types import (
@@ -26,7 +26,6 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.hooks.tables import functions_of, places_of
 
 __all__ = ["OURS", "Changes", "Contents", "borrowed", "differs"]
@@ -109,7 +108,7 @@ class Contents:
             if id(value) in seen:
                 continue
             seen.add(id(value))
-            with Ignoring(Exception):  # users' objects may fail in any way
+            with suppress(Exception):  # users' objects may fail in any way
                 kind = _kind_of(value)
                 if kind is None or _size_of(value) + len(self._kept) > largest:
                     continue
@@ -146,7 +145,7 @@ class Contents:
     def restore(self) -> None:
         """Undo all changes."""
         for one in filter(_has_changed, self._kept):
-            with Ignoring(Exception):  # as above
+            with suppress(Exception):  # as above
                 one.kind.restore(one.value, one.contents)
         for place, name, value in self._outside:
             if place[name] is not value:
@@ -215,7 +214,7 @@ def borrowed(env: FMUEnv, outside: bool = False) -> Iterator[Contents]:
 def _has_changed(kept: _Kept) -> bool:
     try:
         return differs(kept.contents, kept.kind.copy(kept.value))
-    except ordinary(Exception):  # users' objects may fail in any way
+    except Exception:  # users' objects may fail in any way
         return False
 
 
@@ -361,7 +360,7 @@ def differs(before: Any, after: Any) -> bool:
         return True
     try:
         return _differ(before, after)
-    except ordinary(Exception):  # users' values may raise anything when compared
+    except Exception:  # users' values may raise anything when compared
         return False
 
 

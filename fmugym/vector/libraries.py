@@ -12,7 +12,6 @@ from gymnasium.vector import AutoresetMode
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import ordinary
 from fmugym.vector.entry_points import vectorized
 from fmugym.vector.vector_env import FMUVectorEnv
 
@@ -62,7 +61,7 @@ def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
         if module:
             import_module(module)
         creator: Any = gymnasium.spec(name).entry_point
-    except ordinary(ImportError, ValueError, gymnasium.error.Error) as error:
+    except (ImportError, ValueError, gymnasium.error.Error) as error:
         raise ConfigError(f"there is no environment {env_id!r}: {error}") from None
     creator = load_env_creator(creator) if isinstance(creator, str) else creator
     if isinstance(creator, type) and not issubclass(creator, FMUEnv):

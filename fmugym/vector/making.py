@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -10,7 +11,6 @@ from fmugym.archive.fmu import FMU
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import PoolSpec
-from fmugym.signals import Ignoring
 from fmugym.task.construction import require_construction
 from fmugym.task.pool_opening import deferred_pools, env_numbers
 
@@ -57,7 +57,7 @@ class EnvMaker:
         with deferred_pools(self._fmus):
             env = self._make_env()
         if not isinstance(env, FMUEnv):
-            with Ignoring(Exception):  # it is the user's
+            with suppress(Exception):  # it is the user's
                 env.close()
             raise ConfigError(
                 f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, judged
 from fmugym.task.native_draws import no_draws
@@ -156,7 +155,7 @@ class Player:
                 if name in own.parameters:
                     number = own.parameters[name]
                     memory.parameters[name][0] = np.nan if isinstance(number, str) else number
-        except ordinary(Exception):  # a user may have assigned anything
+        except Exception:  # a user may have assigned anything
             return False
         self._rows.step_count[0], memory.ended[0] = own.step_count, False
         self._pool.inputs[:, 0] = own.inputs
@@ -210,7 +209,7 @@ class Player:
                 self._watch()
             else:
                 self._compile(env)
-        except ordinary(Exception) as reason:  # as in ``player_of``
+        except Exception as reason:  # as in ``player_of``
             env.inside.player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled any more: {reason}"
             logger.info("%s. They run in Python, which is slower", text)
@@ -352,7 +351,7 @@ def _call_hooks(env: FMUEnv, readings: Readings) -> None:
         for name in ORDER:
             try:
                 getattr(env, name)()
-            except ordinary(Exception):  # hooks may raise anything
+            except Exception:  # hooks may raise anything
                 continue
 
 

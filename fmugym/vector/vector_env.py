@@ -16,7 +16,6 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 from fmugym.checks import check_count, check_misplaced, check_option
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray
-from fmugym.signals import ordinary
 from fmugym.task.alone import alone
 from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
@@ -568,7 +567,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         construction: Any = type(self), self._arguments, self.spec
         try:
             return _unpickled, (pickle.dumps(CloudpickleWrapper(construction)),)
-        except ordinary(Exception) as error:  # the arguments are the user's
+        except Exception as error:  # the arguments are the user's
             raise ConfigError(
                 f"this {type(self).__name__} cannot be pickled: {error}. Give it a make_env that "
                 "can: a class, a function of a module, or a functools.partial of one of them"

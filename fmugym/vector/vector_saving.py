@@ -12,7 +12,6 @@ from fmugym.checks import integer_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
-from fmugym.signals import ordinary
 from fmugym.task.readings import environments_first, environments_last
 from fmugym.task.saving import READ, read_columns
 from fmugym.task.snapshot import Columns, Snapshot
@@ -49,7 +48,7 @@ def chosen(where: Any, num_envs: int) -> IndexArray:
         if not mask and (array.dtype.kind not in "iu" or array.ndim != 1):
             raise IndexError
         found: IndexArray = indices[array]
-    except ordinary(Exception):  # the indices are out of range, or the caller's object fails
+    except Exception:  # the indices are out of range, or the caller's object fails
         found = indices[:0]
     if not len(found) or len(set(found.tolist())) < len(found):
         raise ConfigError(

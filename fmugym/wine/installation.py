@@ -14,7 +14,6 @@ from urllib.parse import quote
 import fmpy
 
 from fmugym.errors import FMULoadError
-from fmugym.signals import ordinary
 from fmugym.wine.windows_worker import is_buildable, known_program
 
 __all__ = [
@@ -76,7 +75,7 @@ def wine_version(loader: Path) -> str:
         done = subprocess.run(
             [str(loader), "--version"], capture_output=True, text=True, timeout=60, check=True
         )
-    except ordinary(OSError, subprocess.SubprocessError) as error:
+    except (OSError, subprocess.SubprocessError) as error:
         raise FMULoadError(f"Wine does not run: {error}") from None
     return done.stdout.strip()
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fmugym.errors import FMULoadError, printable
-from fmugym.signals import ordinary
 from fmugym.wine.installation import find_wine, obstacle_to_wine, wine_version
 from fmugym.wine.windows_worker import alone, wine_folder, worker_program
 
@@ -127,7 +126,7 @@ def _make(loader: Path, prefix: Path) -> None:
         _link_libraries(prefix)
         (prefix / ".update-timestamp").write_text("disable\n")  # or else Wine writes to the links
         (prefix / _READY).touch()
-    except ordinary(OSError, subprocess.SubprocessError) as error:
+    except (OSError, subprocess.SubprocessError) as error:
         said = log.read_text(errors="replace").strip()[-500:] if log.exists() else ""
         raise FMULoadError(printable(f"Wine cannot make its folder: {error} {said}")) from None
 

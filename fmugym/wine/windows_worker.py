@@ -21,7 +21,6 @@ from typing import Final
 
 from fmugym.caching import cache_folder, own_prefix, sweep
 from fmugym.errors import FMULoadError, printable
-from fmugym.signals import ordinary
 
 if sys.platform != "win32":
     import fcntl
@@ -52,7 +51,7 @@ def wine_folder() -> Path:
     """
     try:
         return cache_folder("wine").absolute()
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise FMULoadError(f"Wine needs a folder in the cache folder: {error}") from None
 
 
@@ -149,7 +148,7 @@ def _compile(target: Path) -> None:
         raise _build_failed(error.output.decode(errors="replace").strip()[-2000:]) from None
     except subprocess.TimeoutExpired:
         raise _build_failed(f"the compiler took longer than {_LONGEST_BUILD:g} s") from None
-    except ordinary(OSError) as error:
+    except OSError as error:
         raise _build_failed(str(error)) from None
 
 

@@ -1,7 +1,6 @@
 """What the tests of vector environments share: comparisons with Gymnasium's own, and classes."""
 
 import contextlib
-import signal
 from collections.abc import Mapping
 
 import gymnasium as gym
@@ -307,34 +306,6 @@ class Shifted(Drawing):
 
     def _get_info(self):
         return {"action": self.action, "before": self.previous_action}
-
-
-class RingError(Exception):
-    """What the handler of a signal raises."""
-
-
-class Ringing(list):
-    """A signal comes while this is converted."""
-
-    def __array__(self, *_, **__):
-        signal.raise_signal(signal.SIGTERM)
-
-    def __getitem__(self, _):
-        signal.raise_signal(signal.SIGTERM)
-
-    __len__ = __iter__ = keys = lambda self: self[0]
-
-
-@pytest.fixture
-def handler():
-    """Let a signal raise ``RingError``."""
-
-    def ring(*_):
-        raise RingError
-
-    before = signal.signal(signal.SIGTERM, ring)
-    yield
-    signal.signal(signal.SIGTERM, before)
 
 
 @pytest.fixture(name="outside")

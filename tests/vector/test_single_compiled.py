@@ -4,7 +4,6 @@ import gc
 import logging
 import math
 import random
-import signal
 import sys
 import weakref
 from types import MethodType
@@ -17,8 +16,6 @@ from fmu_tools import PlainEnv, probe_config
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
     Drawing,
-    RingError,
-    handler,  # noqa: F401  # the fixture "handler"
 )
 
 import fmugym
@@ -609,22 +606,3 @@ class TestSideEffects:
         env = self.play("self.other.state[0] + self.state[0]", {"other": other})
         assert env.inside.player is None
         other.close()
-
-
-@pytest.mark.usefixtures("handler")
-@pytest.mark.parametrize("name", ["find_difference", "compile_hooks"])
-def test_what_a_signal_handler_raises_while_hooks_are_compiled_comes_out(monkeypatch, name):
-    """It is no mistake of the hooks."""
-
-    def interrupted(*arguments):
-        signal.raise_signal(signal.SIGTERM)
-        return usual(*arguments)
-
-    usual = getattr(compiler, name)
-    monkeypatch.setattr(compiler, name, interrupted)
-    with gym.make("fmugym/CartPole-v0", hooks="compiled").unwrapped as env:
-        with pytest.raises(RingError):
-            env.reset(seed=0)
-        monkeypatch.setattr(compiler, name, usual)
-        env.reset(seed=0)
-        env.step(1)

@@ -1,18 +1,11 @@
 """Compiled hooks of vector environments are those of numbers, or are not compiled."""
 
-import contextlib
-import itertools
-import signal
-
 import numpy as np
 import pytest
 from vector_tools import (
     CART_POLE,
     Drawing,
-    PushedCart,
-    RingError,
     fixture_outside,  # noqa: F401  # the fixture "outside"
-    handler,  # noqa: F401  # the fixture "handler"
     require_pair_equal,
     require_same_starts,
     results_of_both,
@@ -21,34 +14,6 @@ from vector_tools import (
 
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.hooks.symbols import Symbols
-
-
-@pytest.mark.usefixtures("handler")
-def test_the_exception_of_a_signal_handler_is_not_that_of_a_hook():
-    """A time limit of the caller must not pass for a hook that cannot be compiled."""
-
-    class Late(PushedCart):
-        weight = 1.0
-        rings = False
-
-        def _reward_policy(self):
-            if isinstance(self.state, Symbols) and self.rings:
-                signal.raise_signal(signal.SIGTERM)
-            return self.weight * super()._reward_policy()
-
-    with contextlib.closing(FMUVectorEnv(Late, 2)) as envs:
-        action = np.zeros(envs.action_space.shape, envs.action_space.dtype)
-        rewards = []
-        for weight in (1.0, 2.0):
-            envs.reset(seed=1)
-            if weight != 1.0:
-                Late.rings = True
-                with pytest.raises(RingError):
-                    envs.set_attr("weight", weight)
-            rewards.append(envs.step(action)[1])
-        assert (rewards[1] == 2.0 * rewards[0]).all()
-        assert rewards[0].all()
-
 
 RARE = {
     "numpy.piecewise": lambda env: np.piecewise(env.state[0], [env.state[0] < 0], [-1.0, 1.0]),
@@ -120,23 +85,6 @@ def test_compiled_hooks_after_a_change(change, mode, outside, make_envs):
         if count == 58:
             already = len(outside)
     assert len(outside) == already < 30
-
-
-@pytest.mark.usefixtures("handler")
-@pytest.mark.parametrize("call", range(1, 5))
-def test_what_a_signal_handler_raises_in_a_hook_comes_out(call):
-    """Wherever the hook is called: alone, on arrays or on symbols."""
-    calls = itertools.count(1)  # a list would be as before when the constructor has failed
-
-    class Ringing(Drawing):
-        def _is_done(self):
-            if next(calls) == call:
-                signal.raise_signal(signal.SIGTERM)
-            return super()._is_done()
-
-    with pytest.raises(RingError):
-        FMUVectorEnv(Ringing, 3)
-    assert next(calls) == call + 1
 
 
 class Weighing(Drawing):

@@ -6,9 +6,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from vector_tools import (
     Drawing,
-    RingError,
-    Ringing,
-    handler,  # noqa: F401  # the fixture "handler"
     make_pair,
     results_of_both,
 )
@@ -88,27 +85,6 @@ class Stepping(Drawing):
     def step(self, action):
         _, *rest = super().step(action)
         return self.observed, *rest
-
-
-@pytest.mark.usefixtures("handler")
-def test_what_a_signal_handler_raises_in_a_conversion_comes_out(monkeypatch, make_envs):
-    envs = make_envs(Stepping, 2, hooks="per_env")
-    envs.reset(seed=0)
-    monkeypatch.setattr(Stepping, "observed", Ringing())
-    with pytest.raises(RingError):
-        envs.step(np.zeros((2, 1), np.float32))
-
-
-@pytest.mark.usefixtures("handler")
-@pytest.mark.parametrize("cls", [SharedArray, OfOtherTypes])
-def test_so_it_does_in_a_single_environment(cls, monkeypatch):
-    """``OfOtherTypes`` observes a dict."""
-    env = cls()
-    env.reset(seed=0)
-    monkeypatch.setattr(cls, "_get_observation", lambda self: Ringing())
-    with pytest.raises(RingError):
-        env.step(np.zeros(1, np.float32))
-    env.close()
 
 
 @pytest.mark.parametrize("observed", [np.zeros(3, np.float32), np.zeros(1), "text", 2**70, None])

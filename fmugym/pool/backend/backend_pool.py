@@ -27,7 +27,6 @@ from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.health import Column, CountedPool, new_arrays, note
 from fmugym.pool.spec import is_start_time
-from fmugym.signals import ordinary
 
 __all__ = ["Backend", "BackendPool"]
 
@@ -133,7 +132,7 @@ class BackendPool(CountedPool):
     def _start(self, starts: Mapping[int, Mapping[str, Any]]) -> None:
         try:
             self._open()
-        except ordinary(Exception) as error:
+        except Exception as error:
             for index in starts:
                 self._take(index, Outcome(Status.ERROR, None, describe_error(error)))
         else:
@@ -292,7 +291,7 @@ def _backends(backend: Any, count: int) -> list[Backend]:
     several = isinstance(backend, Iterable) and not has_method(backend, "step")
     try:
         backends = list(backend) if several else [backend]
-    except ordinary(Exception):  # an iterable whose own methods fail
+    except Exception:  # an iterable whose own methods fail
         backends = [backend]
     for one in backends:
         for method in ("reset", "step", "stop"):
@@ -320,9 +319,9 @@ def _stop(
     try:
         ask_all(calls, clock, _LONGEST_STOP)
         close()
-    except ordinary(TimeoutError):
+    except TimeoutError:
         logger.warning("a backend has not come to its stop within %g s", _LONGEST_STOP)
-    except ordinary(Exception) as error:
+    except Exception as error:
         logger.warning("closing what the backends share failed: %s", error)
 
 

@@ -23,7 +23,6 @@ from fmugym.pool.backend.messages import Messages, fmi1_callbacks, fmi2_callback
 from fmugym.pool.backend.rig import FaultError
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.spec import START_TIME, PoolSpec
-from fmugym.signals import ordinary
 
 __all__ = ["FMPyInstance"]
 
@@ -150,7 +149,7 @@ class FMPyInstance:
                 slave.instantiate(callbacks=fmi2_callbacks, loggingOn=wants_all)
             else:
                 slave.instantiate(loggingOn=wants_all, logMessage=self._messages.note)
-        except ordinary(Exception):
+        except Exception:
             slave.component = None
         if not slave.component:
             slave.freeLibrary()
@@ -169,7 +168,7 @@ class FMPyInstance:
                     instanceName=self._messages.name,
                     libraryPath=str(self._library),
                 )
-        except ordinary(Exception) as error:
+        except Exception as error:
             raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
         if self._version == 1:
             for name in _MISDECLARED:

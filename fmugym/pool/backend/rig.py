@@ -14,7 +14,6 @@ from fmugym.archive.texts import number_of
 from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.spec import PoolSpec
-from fmugym.signals import ordinary
 
 __all__ = ["Backend", "FaultError", "Outcome", "Outputs", "Rig", "describe_error"]
 
@@ -148,7 +147,7 @@ class Rig:
         if self._is_running and self._hold is not None:
             try:
                 self._hold()
-            except ordinary(Exception) as error:
+            except Exception as error:
                 logger.debug("%s.hold failed: %s", type(self._backend).__name__, error)
 
     def stop(self) -> None:
@@ -157,7 +156,7 @@ class Rig:
             self._is_running = False
             try:
                 self._backend.stop()
-            except ordinary(Exception) as error:
+            except Exception as error:
                 logger.warning("%s.stop failed: %s", type(self._backend).__name__, error)
 
     def _try(self, method: str, call: Callable[[], Any]) -> Outcome:
@@ -166,7 +165,7 @@ class Rig:
             outputs, status = _pair(call())
             outcome = self._judged(outputs, status)
             measured = float(getattr(self._backend, "sample_time", called_at))
-        except ordinary(Exception) as error:
+        except Exception as error:
             status = error.status if isinstance(error, FaultError) else Status.ERROR
             outcome, measured = Outcome(status, None, describe_error(error)), called_at
         if outcome.reason:

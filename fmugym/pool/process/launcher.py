@@ -16,13 +16,13 @@ import sys
 import threading
 import weakref
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
 from fmugym.pool.process import guard
 from fmugym.pool.process.shared_memory import Memory
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["Order", "Process", "launch"]
 
@@ -62,7 +62,7 @@ def _import_path() -> list[str]:
     """Where FMUs that run Python look for modules, from any working directory."""
     try:
         return [os.path.abspath(place) for place in sys.path]
-    except ordinary(OSError):  # the working directory has been removed
+    except OSError:  # the working directory has been removed
         return [place for place in sys.path if os.path.isabs(place)]
 
 
@@ -117,7 +117,7 @@ def launch(end: socket.socket, memory: Memory, order: Order, pipes: Sequence[int
     descriptors = end.fileno(), memory.descriptor, *pipes
     try:
         return _guard(order.checks_heap).start(order, descriptors)
-    except ordinary(EOFError, BrokenPipeError, ConnectionResetError):  # it has ended
+    except (EOFError, BrokenPipeError, ConnectionResetError):  # it has ended
         _guards.pop(order.checks_heap, None)
         return _guard(order.checks_heap).start(order, descriptors)
 
@@ -138,7 +138,7 @@ def _heap_check() -> dict[str, str]:
     """The variables by which glibc ends a process that has written beyond a block it frees."""
     try:
         maps = Path("/proc/self/maps").read_text()
-    except ordinary(OSError):
+    except OSError:
         return {}
     found = re.search(r"(/\S*)/libc\.so\.6$", maps, re.MULTILINE)
     checker = Path(found[1]) / "libc_malloc_debug.so.0" if found else None
@@ -250,7 +250,7 @@ class _GuardedProcess:
         return None if len(data) < guard.ANSWER.size else int(guard.ANSWER.unpack(data)[0])
 
     def kill(self) -> None:
-        with Ignoring(OSError):  # the guard has ended, and it has with it
+        with suppress(OSError):  # the guard has ended, and it has with it
             self._lifeline.shutdown(socket.SHUT_WR)
 
     def exit_status(self, timeout: float) -> int | None:

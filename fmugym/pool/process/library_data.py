@@ -15,7 +15,6 @@ from typing import Final, NamedTuple
 
 from fmugym.archive.elf import opened
 from fmugym.archive.fmu import FMU
-from fmugym.signals import ordinary
 
 __all__ = ["library_data"]
 
@@ -53,7 +52,7 @@ def library_data(fmu: FMU, process: int) -> dict[_Place, int]:
     try:
         with open(f"/proc/{process}/mem", "rb", buffering=0) as memory:
             return {place: _checksum(memory, place) for place in places}
-    except ordinary(OSError) as error:
+    except OSError as error:
         logger.warning("data that instances share cannot be watched: %s", error)
         return {}
 

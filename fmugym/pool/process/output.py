@@ -12,10 +12,10 @@ import signal
 import sys
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final
 
 from fmugym.errors import printable
-from fmugym.signals import Ignoring
 
 __all__ = ["Output", "describe_exit", "lines_of_echo"]
 
@@ -125,7 +125,7 @@ class Output:
 
 def _write(stream: int, data: bytes) -> None:
     view = memoryview(data)
-    with Ignoring(OSError):  # this process may have closed it
+    with suppress(OSError):  # this process may have closed it
         while view:
             view = view[os.write(stream, view) :]
 

@@ -48,7 +48,6 @@ from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.reports import REFUSED_ANEW
 from fmugym.pool.requests import Answer, Reader, Request, request_listing
 from fmugym.pool.spec import ResetMethod
-from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
     from fmugym.pool.process.worker_rollouts import PlayOfWorkers
@@ -471,7 +470,7 @@ def _make_memories(spec: PoolSpec, setups: Sequence[Setup]) -> list[Memory]:
     with ExitStack() as made:
         try:
             memories = [made.enter_context(closing(Memory(spec, one.count))) for one in setups]
-        except ordinary(OSError) as error:
+        except OSError as error:
             text = f"no memory can be shared with worker processes: {error}"
             raise FMULoadError(text) from None
         made.pop_all()

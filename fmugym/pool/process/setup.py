@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +21,6 @@ from fmugym.pool.process.launcher import Order
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory
 from fmugym.pool.saving_pool import keeps_records
 from fmugym.pool.spec import ResetMethod
-from fmugym.signals import Ignoring, ordinary
 from fmugym.wine.installation import windows_path
 from fmugym.wine.prefix import Wine
 
@@ -156,7 +156,7 @@ class Setup:
             files, left_out = own / "files", shutil.ignore_patterns(_WORKERS)
             shutil.rmtree(files, ignore_errors=True)
             shutil.copytree(self.folder, files, ignore=left_out)
-        except ordinary(OSError, shutil.Error) as error:
+        except (OSError, shutil.Error) as error:
             raise FMULoadError(
                 f"{self.fmu.path.name} needs a folder for each process: {error}"
             ) from None
@@ -174,7 +174,7 @@ class Setup:
         """
         scratch = self.folder / _WORKERS / str(self.number) / "scratch"
         for text in texts if self.directory else ():
-            with Ignoring(OSError, ValueError):  # it is no path
+            with suppress(OSError, ValueError):  # it is no path
                 own = Path(self.directory, text)
                 first = Path(text).parts[:1]
                 if own.exists() and not os.path.isabs(text) and first != ("..",):
@@ -259,5 +259,5 @@ def _start_texts(fmu: FMU) -> Iterator[str]:
 def _working_directory() -> str:
     try:
         return os.getcwd()
-    except ordinary(OSError):
+    except OSError:
         return ""

@@ -11,6 +11,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
@@ -35,7 +36,6 @@ from fmugym.pool.requests import (
     Request,
 )
 from fmugym.pool.spec import INITIALIZATION_FACTOR
-from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "A_STEP",
@@ -362,7 +362,7 @@ class Supervisor:
             if self.released:
                 self._release()
             self._channel.send(request, deadline=self.deadline)
-        except ordinary(OSError):  # "Ignoring" takes longer
+        except OSError:  # "Ignoring" takes longer
             return
 
     def tell(
@@ -381,7 +381,7 @@ class Supervisor:
         self.is_busy, self._asked, self._read = True, time.monotonic(), read
         self._copies.give()
         self._output.pump()
-        with Ignoring(OSError):
+        with suppress(OSError):
             if self.released:
                 self._release()
             self._channel.send(request, content, self.deadline)
@@ -487,7 +487,7 @@ class Supervisor:
                     result = self._take(code, self._channel.receive_content(size, deadline), read)
                 except LateError:
                     self._end_hang(doing)
-                except ordinary(EOFError, OSError):
+                except (EOFError, OSError):
                     self._explain_death(doing)
                 except DamagedError as error:
                     self._end(f"has sent what is no answer in {doing}", error)
@@ -580,7 +580,7 @@ def _refusals() -> Iterator[None]:
         yield
     except FMULoadError as error:
         raise LostError(str(error)) from None
-    except ordinary(OSError, EOFError) as error:
+    except (OSError, EOFError) as error:
         raise LostError(f"no worker process can be started: {error}") from None
 
 
@@ -591,7 +591,7 @@ def _is_debugged(pid: int) -> bool:
     """
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except ordinary(OSError):
+    except OSError:
         return False
     told = {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
     tracer = told["TracerPid"]
@@ -602,5 +602,5 @@ def _program(process: str) -> str:
     """The file of the program that a process runs; "" if it is another user's."""
     try:
         return os.readlink(f"/proc/{process}/exe")
-    except ordinary(OSError):
+    except OSError:
         return ""

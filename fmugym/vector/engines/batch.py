@@ -23,7 +23,6 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
-from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.beginning import Beginning
@@ -218,7 +217,7 @@ class BatchEngine(Engine):
         task = TracedTask.without_programs(self.env)
         try:
             task = compile_hooks(self.env, [Readings.of(self.env)], self._columns)
-        except ordinary(Exception) as reason:  # as in find_programs
+        except Exception as reason:  # as in find_programs
             logger.info("the hooks cannot be compiled any more: %s", reason)
         finally:
             self._prepare(task)

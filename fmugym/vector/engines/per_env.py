@@ -19,7 +19,6 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.signals import ordinary
 from fmugym.task.actions import take_action
 from fmugym.task.construction import draws_of, prepare_hooks
 from fmugym.task.future import assumed
@@ -200,7 +199,7 @@ class PerEnvEngine(Engine):
                     return joined  # a quarter of the instructions of what follows
             empty: Any = create_empty_array(space, n=count, fn=np.zeros)
             return concatenate(space, self._observations, empty)
-        except ordinary(Exception):  # users' observations may raise anything
+        except Exception:  # users' observations may raise anything
             raise _misfit(space, self._observations) from None
 
     def _reset(
@@ -241,7 +240,7 @@ class PerEnvEngine(Engine):
             return cast(Sequence[Any], checked_actions(space, len(self._envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
-        except ordinary(Exception):  # users' actions may raise anything
+        except Exception:  # users' actions may raise anything
             raise ConfigError(
                 f"the actions do not make one of {space} for each environment: {shown(actions)}"
             ) from None
@@ -318,7 +317,7 @@ def _fits(space: Any, observation: Any) -> bool:
     try:
         empty: Any = create_empty_array(space, n=1, fn=np.zeros)
         concatenate(space, [observation], empty)
-    except ordinary(Exception):  # as above
+    except Exception:  # as above
         return False
     return True
 

@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.signals import ordinary
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
@@ -73,7 +72,7 @@ def attempt(env: FMUEnv, make: Callable[[], _Made], required: bool, where: str) 
     """
     try:
         return make()
-    except ordinary(Exception) as reason:  # hooks may raise anything
+    except Exception as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None

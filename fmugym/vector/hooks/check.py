@@ -16,7 +16,6 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray
-from fmugym.signals import ordinary
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import ORDER
 from fmugym.task.values import ParameterValues
@@ -296,7 +295,7 @@ class _Failure(NamedTuple):
 def _result_of(env: FMUEnv, name: str) -> Any:
     try:
         result = getattr(env, name)()
-    except ordinary(Exception) as error:
+    except Exception as error:
         return _Failure(f"{type(error).__name__}: {error}")
     return dict(env.variables) if name == "_update" else result
 
@@ -305,7 +304,7 @@ def _same(expected: Any, together: Any, index: int, count: int) -> bool:
     """Whether one environment's part of a result on arrays is its result alone; NaNs are equal."""
     try:
         return _equal(expected, together, index, count)
-    except ordinary(Exception):  # the results are the user's, and may be anything
+    except Exception:  # the results are the user's, and may be anything
         return False
 
 

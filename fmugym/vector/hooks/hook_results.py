@@ -17,7 +17,6 @@ from gymnasium import spaces
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.signals import ordinary
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.readings import environments_first
 from fmugym.task.results import given
@@ -109,7 +108,7 @@ def _expected(hook: str, value: Any, wanted: str) -> Iterator[None]:
         yield
     except FMUGymError:
         raise
-    except ordinary(Exception):
+    except Exception:
         raise _mismatch(hook, value, wanted) from None
 
 
@@ -154,7 +153,7 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
     try:
         array = np.array(value)
         fits = array.dtype.kind in _NUMBERS and array.shape[-1:] in {(), (count,)}
-    except ordinary(Exception):  # lists that make no array, or objects whose own methods fail
+    except Exception:  # lists that make no array, or objects whose own methods fail
         fits = False
     if not fits:
         raise ConfigError(

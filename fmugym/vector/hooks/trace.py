@@ -19,7 +19,6 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.signals import ordinary
 from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import ORDER
 from fmugym.vector.contents import Contents, borrowed
@@ -418,7 +417,7 @@ def in_hook(env: FMUEnv, name: str) -> Iterator[None]:
     """Call a hook on symbols: what it raises becomes an ``UntraceableError`` with its place."""
     try:
         yield
-    except ordinary(Exception) as error:  # hooks do with numbers what symbols cannot do
+    except Exception as error:  # hooks do with numbers what symbols cannot do
         raise UntraceableError(_placed(env, name, error)) from error
 
 

@@ -300,6 +300,17 @@ class TestEndOfParent:
         wait_until(lambda: not any(map(is_alive, pids)))
         assert list(temp_root.iterdir()) == []
 
+    @posix_only
+    @pytest.mark.parametrize("call", ["env.step([1.0])", "env.reset()"])
+    def test_by_ctrl_c_in_a_call(self, start, temp_root, call):
+        program, pids = start(f"env.reset()\nprint('playing', flush=True)\nwhile True: {call}")
+        assert program.stdout.readline() == "playing\n"
+        time.sleep(0.1)
+        os.killpg(program.pid, signal.SIGINT)
+        assert "KeyboardInterrupt" in program.communicate()[1]
+        wait_until(lambda: not any(map(is_alive, pids)))
+        assert list(temp_root.iterdir()) == []
+
     @linux_only
     def test_while_the_fmu_hangs(self, start, temp_root):
         end = "env.reset(options={'model_parameters': process_tools.start_values('hang', at=1)})"
