@@ -71,7 +71,7 @@ SLOW_MODULES = {
 """Programs that train, build, measure, or make cases by the hundred."""
 
 EVERY = {
-    "test_golden_tasks": 1,
+    "test_golden_tasks": 4,
     "test_hostile_archive": 19,
     "test_licences": 23,
     "test_neighbours": 7,

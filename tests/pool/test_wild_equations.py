@@ -147,6 +147,7 @@ class StillEnv(fmugym.FMUEnv):
 @contextmanager
 def interrupted_soon(number=signal.SIGINT, after=0.3):
     """A signal comes in the block, which raises KeyboardInterrupt."""
+    before = signal.signal(number, signal.default_int_handler)  # it may have been ignored
     timer = threading.Timer(after, os.kill, (os.getpid(), number))
     timer.start()
     try:
@@ -154,6 +155,7 @@ def interrupted_soon(number=signal.SIGINT, after=0.3):
             yield
     finally:
         timer.cancel()
+        signal.signal(number, before)
 
 
 class TestSignals:
