@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from itertools import count, takewhile
-from math import floor
+from math import floor, isfinite
 from pathlib import Path
 from typing import Any, Final
 
@@ -208,7 +208,8 @@ class PoolOpening:
         limits = [max_episode_steps, self.config.max_episode_steps]
         if self.spec.stop_time is not None:
             span = self.spec.stop_time - self.spec.start_time
-            limits.append(max(1, floor(span / self.spec.time_step + 1e-9)))
+            steps = span / self.spec.time_step
+            limits.append(max(1, floor(steps + 1e-9)) if isfinite(steps) else None)
         return min((limit for limit in limits if limit is not None), default=None)
 
     def apart(self) -> PoolOpening:

@@ -57,7 +57,8 @@ def test_info_says_what_is_wrong_and_of_an_fmu_nothing(ran, task):
     assert "\nData" not in ran("info", task)
 
 
-def test_a_log_of_local_time_needs_its_zone(ran, refused, tmp_path):
+def test_a_log_of_local_time_needs_its_zone(refused, tmp_path):
+    pytest.importorskip("minari", reason="needs Minari: the extra minari")
     task = tmp_path / "task.toml"
     task.write_text('timezone = "+01:00"' + TASK.partition("[data]")[0].replace("-p", "-q**2"))
     more = TASK[TASK.index("[agent]") :].replace('"p", "q", "q_dot"', '"q", "q_dot"')

@@ -33,13 +33,13 @@ class TestNew:
         assert bad <= (of_house if model == "House" else {"observations"})
 
     def test_names_that_are_no_names_of_python(self, tmp_path, ran, load):
-        odd = {'name="tau"': 'name="a.b[1] &quot;x&quot;\\ \u00e4"', 'name="q"': 'name="time"'}
+        odd = {'name="tau"': 'name="a.b[1] &quot;x&quot;\\ \u00e4"', 'name="q"': 'name="step"'}
         fmu = edited_fmu(fmugym.bundled_fmu("Pendulum"), tmp_path, odd)
         out = ran("new", fmu)
         assert out.isascii()
         env = load(tomllib.loads(out))
         assert env.config.model_input_names == ('a.b[1] "x"\\ \u00e4',)
-        assert "time" in env.config.model_output_names
+        assert "step" in env.config.model_output_names
 
     def test_the_path_of_an_fmu_below_the_file_is_relative(self, tmp_path, cli):
         (tmp_path / "fmus").mkdir()

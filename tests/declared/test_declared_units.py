@@ -416,6 +416,7 @@ class TestValidate:
         }
         with pytest.raises(fmugym.ConfigError, match='fmu_unit = "K"'):
             Probe.of(lambda: fmugym.load(task), 2, print)
+        pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3")
         settings = TrainingSettings(lambda: fmugym.load(task), {}, tmp_path / "agent", steps=5000)
         with pytest.raises(fmugym.ConfigError, match='fmu_unit = "K"'):
             train(settings)

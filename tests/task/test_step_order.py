@@ -5,7 +5,6 @@ import numpy as np
 from vector_tools import Drawing
 
 import fmugym
-from fmugym.vector.hooks.trace import trace_hooks
 
 ORDER = (
     *("_get_inputs", "_update", "_is_done", "_is_truncated", "_reward_policy"),
@@ -104,15 +103,3 @@ class Plain(Recording):
 
     def _reward_policy(self):
         return self._note("_reward_policy", np.where(self.done, -1.0, 1.0 * self.step_count))
-
-
-def test_compiled(make_envs):
-    env = Plain()
-    CALLED.clear()
-    trace_hooks(env)
-    assert [hook for hook in ORDER if hook in CALLED] == list(dict.fromkeys(CALLED))
-    env.close()
-    vector = make_envs(Plain, 3, hooks="compiled")
-    called, values = played(vector, np.zeros(3, np.int64))
-    assert called == []
-    assert values == EXPECTED
