@@ -201,16 +201,6 @@ class TestCommand:
         ran(*command, "--episodes", "2", "--force")
         assert len(read_dataset("test/once-v0")) == 2
 
-    def test_the_old_name_of_the_command_warns(self, folder, cli):
-        command = ["dataset", "test/old-v0", "--task", "fmugym/CartPole-v0", "--episodes", "1"]
-        code, _, err = cli(*command)
-        assert code == 0
-        assert "fmugym simulate fmugym/CartPole-v0" in err
-        code, _, err = cli("dataset", "test/old-v0", "--output", folder / "old")
-        assert code == 0
-        assert "fmugym info minari:test/old-v0" in err
-        assert len(list((folder / "old").iterdir())) == 1
-
 
 def test_the_record_of_a_shadow(folder, monkeypatch, ran, refused):
     """With a gap, on the plant's time, and with the data that the record has."""

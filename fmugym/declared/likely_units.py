@@ -9,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import numpy as np
+
 from fmugym.archive.description import ModelDescription, Unit
 from fmugym.archive.units import IDENTITY, Conversion, conversion_of
 from fmugym.archive.variable import Variable
@@ -17,6 +19,7 @@ from fmugym.task.quantity import Quantity
 
 __all__ = [
     "Misreading",
+    "finite_values",
     "likely_unit",
     "likely_units",
     "misreadings",
@@ -288,9 +291,8 @@ def require_units(env: Any) -> None:
         return
     env.reset(seed=0)
     quantities = env.inside.quantities()
-    values = map(float, quantities.read(env))
-    pairs = zip(quantities.all, values, strict=True)
-    seen = {one.name: [value] for one, value in pairs if math.isfinite(value)}
+    pairs = zip(quantities.all, quantities.read(env), strict=True)
+    seen = {one.name: finite_values([value]) for one, value in pairs}
     for one in misreadings(env, seen):
         if one.contradicts:
             raise ConfigError(f"{one.text}: write {one.line} under [variables]")
@@ -302,6 +304,12 @@ def _open_names(env: Any) -> Iterator[str]:
         has_limits = "unit" in declared and not declared.keys().isdisjoint({"min", "max"})
         if has_limits and _without_unit(env, declared.get("name", name)) is not None:
             yield name
+
+
+def finite_values(values: Iterable[Any]) -> list[float]:
+    """The finite numbers among numbers and arrays."""
+    numbers = [float(number) for value in values for number in np.ravel(value)]
+    return [number for number in numbers if math.isfinite(number)]
 
 
 _KINDS: Final = ("action", "input", "output", "parameter")

@@ -22,7 +22,7 @@ from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.baselines.parsing import controller_of, plans_ahead, simple_controllers
 from fmugym.checks import normal_form
 from fmugym.declared import Task, TaskEnv, load
-from fmugym.declared.likely_units import Misreading, misreadings
+from fmugym.declared.likely_units import Misreading, finite_values, misreadings
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.episodes.simulation import action_of
@@ -445,13 +445,13 @@ def _misread(env: FMUEnv) -> list[Misreading]:
     quantities, rows = quantities_of(env), list[Any]()
 
     def choose() -> Any:
-        rows.append([float(value) for value in quantities.read(env)])
+        rows.append(quantities.read(env))
         return env.action_space.sample()
 
     env.action_space.seed(0)
     _play(env, choose)
-    columns = zip(quantities.all, np.transpose(rows), strict=True)
-    seen = {one.name: values[np.isfinite(values)].tolist() for one, values in columns}
+    columns = zip(quantities.all, zip(*rows, strict=True), strict=True)
+    seen = {one.name: finite_values(values) for one, values in columns}
     return list(misreadings(env, seen))
 
 

@@ -192,7 +192,7 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, ran):
     (name,) = FMU(fmu_path).missing_libraries
     monkeypatch.chdir(tmp_path)
     assert f'preload = ["{tmp_path / name}"]' in ran("info", "--repair", fmu_path)
-    ran("stand-in", fmu_path, "--folder", "a/b")
+    ran("info", "--repair", fmu_path, "--output", "a/b")
     assert (tmp_path / "a" / "b" / name).is_file()
     with pytest.raises(ConfigError, match="cannot hold libraries"):
         stand_in.build_stand_in(FMU(fmu_path), tmp_path / name / "inside")

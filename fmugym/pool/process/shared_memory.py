@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym._native import copy_arrays
 from fmugym.pool.health import Arrays, HealthArray, layout_of
 from fmugym.pool.spec import PoolSpec
 
@@ -113,6 +112,9 @@ class Copies:
     """
 
     def __init__(self, arrays: Arrays, block: slice, memory: Memory) -> None:
+        from fmugym._native import copy_arrays  # which is not there on every machine
+
+        self._copy = copy_arrays
         own = memory.arrays._asdict()
         blocks = {
             "inputs": arrays.inputs[:, block],
@@ -126,25 +128,27 @@ class Copies:
             blocks = {}
         else:
             self._counts = (arrays.counts[block],), (memory.arrays.counts,)
+        blocks = {name: block for name, block in blocks.items() if block.size}
         self._pairs = tuple(own[name] for name in blocks), tuple(blocks.values())
-        self._for_step = tuple(part[:2] for part in self._pairs)
+        read = [name for name in ("inputs", "mask") if name in blocks]
+        self._for_step = tuple(own[name] for name in read), tuple(blocks[name] for name in read)
 
     def give(self) -> None:
         """Copy what the worker may read or change."""
-        copy_arrays(*self._pairs)
+        self._copy(*self._pairs)
 
     def give_for_step(self) -> None:
         """Copy what the worker reads in a step; it writes all the rest."""
-        copy_arrays(*self._for_step)
+        self._copy(*self._for_step)
 
     def take(self) -> None:
         """Copy what the worker may have changed."""
         shared, blocks = self._pairs
-        copy_arrays(blocks, shared)
+        self._copy(blocks, shared)
 
     def take_counts(self) -> None:
         """Copy the counts."""
-        copy_arrays(*self._counts)
+        self._copy(*self._counts)
 
 
 def _anonymous_file(size: int) -> int:
