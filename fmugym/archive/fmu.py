@@ -16,6 +16,7 @@ import shutil
 import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -493,7 +494,8 @@ class FMU(KnownArguments):
             self._archive.extract(folder, files, folders)
         except BaseException:  # a file that is cut short would pass for one that is there
             for target in files.values():
-                (folder / target).unlink(missing_ok=True)
+                with suppress(OSError):  # it is not there, or its name is too long
+                    (folder / target).unlink()
             raise
         return True
 
