@@ -116,6 +116,7 @@ Status solved_initialize(const Library *library, void *component, const Experime
                          StartValues start_values, const char **doing) {
     Solver *me = component;
 
+    (void)library;
     forget(component);
     me->memory.time = experiment->start_time;
     if (me->solving->number_of_clocks > 0) {
