@@ -6,7 +6,7 @@
 #include "inside.h"
 #include "log.h"
 
-enum { FEW = 15, SHORT = 1000000 /* ns */ };
+enum { FEW = 15, SHORT_STEP = 1000000 /* ns */ };
 
 static void say(const Solver *me, Status status, const char *format, va_list values) {
     char text[300];
@@ -39,7 +39,7 @@ bool solver_is_interrupted(Solver *me) {
         return false;
     }
     const uint64_t now = clock_now();
-    me->unseen = now - me->looked < SHORT ? FEW : 0;
+    me->unseen = now - me->looked < SHORT_STEP ? FEW : 0;
     me->looked = now;
     return is_interrupted();
 }
