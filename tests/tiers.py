@@ -123,6 +123,19 @@ EVERY_OF_OTHERS_IN_CI = 4
 """For the modules that are not in ``EVERY_IN_CI``; their parameters take turns."""
 
 SLOW_TESTS = (
+    "test_baselines_mpc.py::TestCommandLine::test_a_report",
+    "test_baselines_mpc.py::TestCommandLine::test_compares",
+    "test_env.py::test_time_is_exact",
+    "test_identification.py::TestMeasured",
+    "test_plant.py::TestCommands::test_simulate_plant",
+    "test_plant.py::TestMPC",
+    "test_plant.py::TestServer::test_tells_what_sensors_show",
+    "test_plant.py::TestShadow::test_records",
+    "test_process_files.py::test_names_of_instances",
+    "test_search.py::TestBudget::test_of_slow_fmus",
+    "test_search.py::test_a_process_that_constants",
+    "test_series.py::TestReport::test_it_has_the_interval",
+    "test_slow_models.py::TestTime",
     "test_golden_tasks.py::test_an_onnx",
     "test_golden_tasks.py::test_is_as_it_was[exported",
     "test_golden_tasks.py::test_is_as_it_was[training",
@@ -258,6 +271,11 @@ EXHAUSTIVE_TESTS = (
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
     "test_windows_fmus.py::TestProgram::test_its_sources_fit",
+    "test_packaging.py::test_without_a_compiler",
+    "test_benchmarks.py::test_heavy_steps",
+    "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[prothero",
+    "test_soak.py",
+    "test_fuzz_hooks.py",
 )
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 
