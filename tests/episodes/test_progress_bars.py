@@ -14,7 +14,7 @@ class Terminal(io.StringIO):
 
 
 def test_parts_of_steps_are_rounded(monkeypatch):
-    pytest.importorskip("tqdm")
+    pytest.importorskip("tqdm", reason="needs the extra sb3")
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("tqdm.tqdm.monitor_interval", 0)

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dis import get_instructions
+from functools import lru_cache
+from itertools import chain
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, Final
 
@@ -299,12 +301,12 @@ def defaults_of(function: FunctionType) -> dict[str, Any]:
     return dict(zip(names, defaults, strict=True)) | (function.__kwdefaults__ or {})
 
 
-def _imports_in(code: CodeType) -> Iterator[str]:
+@lru_cache(maxsize=1024)  # reading instructions takes long
+def _imports_in(code: CodeType) -> tuple[str, ...]:
     """The names of the modules that some code imports itself."""
-    yield from (one.argval for one in get_instructions(code) if one.opname == "IMPORT_NAME")
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _imports_in(constant)
+    own = [one.argval for one in get_instructions(code) if one.opname == "IMPORT_NAME"]
+    inner = [_imports_in(one) for one in code.co_consts if isinstance(one, CodeType)]
+    return (*own, *chain.from_iterable(inner))
 
 
 def names_in(code: CodeType) -> Iterator[str]:
