@@ -41,17 +41,16 @@ bool handlers_prepare(void) {
            current_frame != NULL && noting != NULL;
 }
 
-/* Only there does Python run handlers. */
-static bool is_main_thread(void) {
+/* Sets whether this is the main thread: only there does Python run handlers. This function of Python may
+ * do so as well: returns false with what one has raised. */
+static bool ask_for_main_thread(bool *is_main) {
     PyObject *thread = PyObject_CallNoArgs(main_thread);
     PyObject *number = thread == NULL ? NULL : PyObject_GetAttrString(thread, "ident");
-    const bool found =
-        number != NULL && PyLong_AsUnsignedLong(number) == PyThread_get_thread_ident();
 
+    *is_main = number != NULL && PyLong_AsUnsignedLong(number) == PyThread_get_thread_ident();
     Py_XDECREF(thread);
     Py_XDECREF(number);
-    PyErr_Clear();
-    return found;
+    return !PyErr_Occurred();
 }
 
 /* The handler of a signal if it is Python's, and does not only note it already; or NULL. */
@@ -75,8 +74,14 @@ static bool set(int number, PyObject *handler) {
 }
 
 bool handlers_hold(Held *held) {
+    bool is_main;
+
     held->count = 0;
-    if (!is_main_thread()) {
+    held->raised = NULL;
+    if (!ask_for_main_thread(&is_main)) {
+        return false;
+    }
+    if (!is_main) {
         return true;
     }
     for (int number = 1; number < MOST_SIGNALS && held->count < MOST_HELD; number++) {
@@ -181,8 +186,39 @@ PyObject *py_undisturbed(PyObject *module, PyObject *args) {
     return result;
 }
 
+void handlers_hold_at_the_end(Held *held) {
+    PyObject *first = NULL;
+
+    while (!handlers_hold(held)) {
+        PyObject *type, *value, *traceback;
+
+        PyErr_Fetch(&type, &value, &traceback);
+        PyErr_NormalizeException(&type, &value, &traceback);
+        Py_XDECREF(type);
+        Py_XDECREF(traceback);
+        if (first == NULL) {
+            first = value;
+        } else {
+            Py_XDECREF(value);
+        }
+    }
+    held->raised = first;
+}
+
+static int raise(void *value) {
+    PyObject *error = value;
+
+    PyErr_SetObject((PyObject *)Py_TYPE(error), error);
+    Py_DECREF(error);
+    return -1;
+}
+
 void handlers_postpone(Held *held) {
+    PyObject *raised = held->raised;
     Raised first = {.type = NULL};
 
     release(held, false, &first);
+    if (raised != NULL && Py_AddPendingCall(raise, raised) != 0) {
+        Py_DECREF(raised); /* too much else is to be done */
+    }
 }

@@ -12,6 +12,7 @@ typedef struct {
     size_t count;
     int numbers[MOST_HELD];
     PyObject *handlers[MOST_HELD];
+    PyObject *raised; /* by a handler that ran before; see handlers_hold_at_the_end */
 } Held;
 
 /* Must be called once before anything else. Returns false with an exception. */
@@ -25,7 +26,9 @@ bool handlers_hold(Held *held);
  * one that there was before. */
 bool handlers_release(Held *held);
 
-/* The same where nothing can be raised: the handlers run later. */
+/* The same two where nothing can be raised, as when an object is freed: what a handler raises comes at
+ * the next instruction of Python, and the handlers of the signals that were noted run there. */
+void handlers_hold_at_the_end(Held *held);
 void handlers_postpone(Held *held);
 
 /* A function of the module */

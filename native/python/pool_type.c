@@ -50,9 +50,7 @@ static void close_at_the_end(PyPool *self) {
     Held held;
 
     PyErr_Fetch(&type, &value, &traceback);
-    if (!handlers_hold(&held)) {
-        PyErr_WriteUnraisable(NULL);
-    }
+    handlers_hold_at_the_end(&held);
     if (!close_pool(self)) {
         PyErr_WriteUnraisable(NULL);
     }

@@ -12,8 +12,8 @@ static void abandon(PyPool *pool, Snapshot *snapshot) {
     PyObject *type, *value, *traceback;
 
     PyErr_Fetch(&type, &value, &traceback);
-    if (pool->calls_python && !handlers_hold(&held)) {
-        PyErr_WriteUnraisable(NULL);
+    if (pool->calls_python) {
+        handlers_hold_at_the_end(&held);
     }
     pool_abandon(&pool->pool, snapshot);
     handlers_postpone(&held);

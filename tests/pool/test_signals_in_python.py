@@ -4,8 +4,11 @@ Python runs handlers between two of its instructions, also between those of the 
 catches what they raise.
 """
 
+import _thread
+import collections
 import contextlib
 import functools
+import operator
 import signal
 import subprocess
 import sys
@@ -15,9 +18,11 @@ from pathlib import Path
 
 import makers
 import numpy as np
+import pool_tools
 import pytest
 
 import fmugym
+from fmugym import FMU, _native
 from fmugym.vector import FMUVectorEnv
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -37,7 +42,8 @@ def ring(number, frame):
 
 @pytest.fixture(scope="module")
 def fmu(tmp_path_factory):
-    return makers.by_python("pythonfmu", "foreign_signalled.py")(tmp_path_factory.mktemp("fmu"))
+    make = makers.by_python("pythonfmu", "foreign_signalled.py", canGetAndSetFMUstate="true")
+    return make(tmp_path_factory.mktemp("fmu"))
 
 
 @pytest.fixture(params=["Ctrl-C", "a handler"])
@@ -125,17 +131,18 @@ def test_a_rollout(make, raised):
         assert short.observations[:, -1, 0] == pytest.approx([0.2] * 3, rel=1e-6)
 
 
+@pytest.mark.parametrize("raised", ["Ctrl-C"], indirect=True)
 def test_the_classes_of_fmpy(fmu, make, raised, monkeypatch):
-    """They are in the caller's process, too."""
+    """They are in the caller's process, too; other errors of handlers are failures of the FMU."""
     with make(STEP)(backend="fmpy") as env:
         env.reset(seed=0)
         assert len(play(env, 3)) == 3
-        with pytest.raises(raised[1]):
+        with pytest.raises(KeyboardInterrupt):
             play(env, 1)
-    with make(INITIALIZATION)(backend="fmpy") as env, pytest.raises(raised[1]):
+    with make(INITIALIZATION)(backend="fmpy") as env, pytest.raises(KeyboardInterrupt):
         env.reset(seed=0)
     monkeypatch.setenv("FMUGYM_TEST_SIGNAL", str(int(raised[0])))
-    with pytest.raises(raised[1]):
+    with pytest.raises(KeyboardInterrupt):
         make(0)(backend="fmpy")
 
 
@@ -148,6 +155,30 @@ def test_what_an_mpc_plans_on(make, raised):
             mpc.act(observation)
         assert not mpc._copies.health["errors"].any()
         mpc.close()
+
+
+class TestAtOnce:
+    """A signal has arrived, and Python runs no other instruction before the call."""
+
+    @staticmethod
+    def interrupted(call):
+        """Requires that a call, or what comes within a second of it, is interrupted."""
+        calls = map(operator.call, (_thread.interrupt_main, call))
+        with pytest.raises(KeyboardInterrupt):  # noqa: PT012  it may come after the call
+            collections.deque(calls, 0)
+            time.sleep(1)
+
+    def test_a_function(self):
+        _native.undisturbed(len, ())
+        self.interrupted(functools.partial(_native.undisturbed, len, ()))
+
+    def test_the_end_of_a_snapshot(self, fmu):
+        pool = pool_tools.open_pool(FMU(fmu), ("u",), ("y",), n=2)
+        pool_tools.start(pool)
+        snapshots = [pool.save()]
+        self.interrupted(snapshots.clear)
+        assert not pool.step()[1].any()
+        pool.close()
 
 
 def test_a_handler_that_returns_lets_the_episode_go_on(make, raised):

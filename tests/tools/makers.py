@@ -33,12 +33,12 @@ class Made:
     parameters: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
-def by_python(package, script):
-    """An FMU with a Python interpreter in it."""
+def by_python(package, script, **options):
+    """An FMU with a Python interpreter in it, built with options of the package."""
 
     def build(folder):
         builder = pytest.importorskip(f"{package}.builder", reason=NO_PACKAGE.format(package))
-        path = Path(builder.FmuBuilder.build_FMU(HERE / "tools" / script, dest=folder))
+        path = Path(builder.FmuBuilder.build_FMU(HERE / "tools" / script, dest=folder, **options))
         if not fmugym.FMU(path).runs_here:
             pytest.skip(f"{package} has no binary for this platform")
         return path
