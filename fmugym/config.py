@@ -168,8 +168,8 @@ class Foreign(KnownArguments):
     )
     leak_limit: int | None = key(
         or_none(LARGE_COUNT),
-        "Bytes that resets may leak before the log [says so](reliability.md#leaks), and by which a "
-        "worker may grow before it is replaced. `None`: no limit.",
+        "Bytes by which a worker process may grow before it is [replaced](reliability.md#leaks). "
+        "`None`: no limit.",
         DEFAULT_LEAK_LIMIT,
     )
     max_instances: int | None = key(

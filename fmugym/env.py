@@ -402,9 +402,8 @@ class FMUEnv(Constructed):
 
         ``resets``; ``steps`` (communication steps); faults by kind: ``discards``, ``errors``,
         ``fatals``, ``not_finite``, ``deaths`` (of its worker process); ``retries`` of discarded
-        steps; ``replacements`` of the instance, and of these ``recyclings`` of a worker process
-        that had grown; and ``memory_growth``, the bytes that resets have taken from this process,
-        or by which its worker process has grown.
+        steps; and ``replacements`` of the instance, of these ``recyclings`` of a worker process
+        that had grown.
 
         Raises:
             SimulationError: If the environment is closed.

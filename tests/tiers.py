@@ -185,7 +185,6 @@ SLOW_TESTS = (
     "test_fit.py::TestPendulum::test_what_the_log",
     "test_fit.py::test_intervals",
     "test_fit.py::test_logs",
-    "test_guards.py::TestLeaks",
     "test_held_out.py::test_a_folder",
     "test_hostile_archive.py::TestMemory",
     "test_identification.py::TestOutputError",

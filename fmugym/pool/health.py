@@ -136,16 +136,10 @@ class CountedPool(Pool):
     def _count_steps(self) -> None:
         """Add the steps so far to the counts."""
 
-    def _memory_growth(self) -> Any:
-        """The growth of memory in bytes: one number for each instance, or one for all."""
-        return 0
-
     def health(self) -> dict[str, HealthArray]:
         """See ``Pool.health``."""
         self._count_steps()
-        columns = {name: self._counts[:, index].copy() for index, name in enumerate(HEALTH)}
-        growth = np.full(len(self._counts), self._memory_growth(), np.int64)
-        return columns | {"memory_growth": growth}
+        return {name: self._counts[:, index].copy() for index, name in enumerate(HEALTH)}
 
     def forget_health(self) -> None:
         """See ``Pool.forget_health``."""

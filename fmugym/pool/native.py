@@ -36,7 +36,6 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import new_arrays
-from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.reports import Receiver, loading_failed
 from fmugym.pool.requests import (
@@ -119,11 +118,10 @@ class NativePool(AskingPool):
         self._prepare_saving(fmu.description, spec)
         self._answers = Answers(fmu.description, spec, slice(0, num_instances))
         self.step_own = self._pool.step_own
-        self._watch = watch_leaks(fmu, spec, self._counts, log)
-        self._reset = self._watched(self._pool.reset)
+        self._reset = self._pool.reset
         self._starting_play = (
-            self._with_files(self._watched(self._pool.play)),
-            self._with_files(self._watched(self._pool.reset_by)),
+            self._with_files(self._pool.play),
+            self._with_files(self._pool.reset_by),
         )
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
@@ -258,13 +256,6 @@ class NativePool(AskingPool):
         if self._close.alive:
             self._ask_pool(Request.COUNT_STEPS, b"", Reader.end)
 
-    def _memory_growth(self) -> int:
-        return 0 if self._watch is None else self._watch.growth
-
-    def _watched(self, function: Callable[P, R]) -> Callable[P, R]:
-        """Add the memory that a reset function allocates to the growth counter."""
-        return function if self._watch is None else self._watch.around(function)
-
     def close(self) -> None:
         """See ``Pool.close``."""
         try:
@@ -309,7 +300,7 @@ class NativePool(AskingPool):
     # Steps with compiled hooks.
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
-        """See ``Pool.prepare_play``; the memory that resets allocate is added to the growth."""
+        """See ``Pool.prepare_play``."""
         pool = self._pool
         prepare(pool, self._access(variables), *parts)
         step, reset = self._starting_play

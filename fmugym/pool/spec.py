@@ -54,7 +54,7 @@ INITIALIZATION_FACTOR: Final = 10
 """How many times as long as another call an instantiation or initialization may take."""
 
 DEFAULT_LEAK_LIMIT: Final = 64 * 2**20
-"""How many bytes resets may leak."""
+"""By how many bytes a worker process may grow."""
 
 
 START_TIME: Final = Variable(
@@ -109,8 +109,8 @@ class PoolSpec:
             first output is read.
         fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
             8 ... smaller ones, from the FMU state before it.
-        leak_limit: How many bytes resets may leak before that is told, and by how many a worker
-            process may grow before it is replaced; None for no limit.
+        leak_limit: By how many bytes a worker process may grow before it is replaced; None for no
+            limit.
         reset_method: How instances start a new episode.
         component_resets: For each component of a system, how it starts a new episode; empty if all
             do by ``reset_method``.

@@ -38,7 +38,7 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.form import Writer
-from fmugym.pool.health import Column, HealthArray, new_arrays
+from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
@@ -384,12 +384,6 @@ class ProcessPool(AskingPool):
         if self._spec.fault_retries:
             self._take_counts()
         return super().info()
-
-    def _memory_growth(self) -> HealthArray:
-        growth = np.zeros(self.num_instances, np.int64)
-        for supervisor in self._group.supervisors:
-            growth[supervisor.block] = supervisor.growth
-        return growth
 
     def _find_text(self, number: float) -> str | None:
         """Ask the workers for a text that an FMU of theirs has given."""
