@@ -190,7 +190,6 @@ SLOW_TESTS = (
     "test_identification.py::TestOutputError",
     "test_identification.py::test_example",
     "test_lab_sessions.py::TestNothingLeaks",
-    "test_licences.py::TestInitializations::test_of_a_vector_environment",
     "test_licences.py::TestInitializations::test_trials_keep",
     "test_licences.py::TestInitializations::test_without_a_trial",
     "test_licences.py::TestRefusal::test_in_a_later_reset",

@@ -22,7 +22,7 @@ from fmugym.pool.base import FloatArray
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.trial_episodes import Inputs, Run, Starts, Stretch, play
 from fmugym.trial.verdict import Finding, Grade
-from fmugym.trial.workers import INITIALIZATION, TriedPool, Workers
+from fmugym.trial.workers import TriedPool, Workers
 
 __all__ = ["AMPLITUDES", "BUDGET", "SMALL_BUDGET", "Budget", "Reference"]
 
@@ -39,9 +39,6 @@ _SURE: Final = 10
 
 _LEAST: Final = 30
 """The least steps of the longest episode, unless all steps are slow."""
-
-_SLOW_INITIALIZATION: Final = 2.0
-"""The seconds of real time from which an initialization counts as slow."""
 
 AMPLITUDES: Final = (1.0, 0.1, 0.0)
 """How far inputs move, as fractions of their range; the smaller ones for FMUs that fail."""
@@ -101,8 +98,6 @@ class Reference:
             because the FMU or the time ends a longer one.
         noisy: The names of the outputs that two fresh instances give differently, as far as known.
         step_seconds: The real time of the fastest step; infinite before.
-        is_frugal: Whether fewer episodes are played, because initializations are slow or need
-            licences.
         fails_in_reading: Whether even a fresh instance cannot play an episode, because its outputs
             cannot be read.
     """
@@ -115,7 +110,7 @@ class Reference:
         self.steps, self.tried_length = 0, length
         self.noisy: tuple[str, ...] = ()
         self.step_seconds = math.inf
-        self.is_frugal, self.fails_in_reading = spec.licence_wait > 0.0, False
+        self.fails_in_reading = False
         tolerance = _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)  # of the largest magnitude
         self._tolerances, self._knows_noise = np.full(len(spec.outputs), tolerance), False
 
@@ -171,7 +166,6 @@ class Reference:
             stretch = Stretch((0,), self._length or sys.maxsize)
             run = play(pool, self.starts, self.inputs, [stretch], budget)[0][0]
             failure = "" if run.played else pool.failure(0)
-        self.is_frugal |= self.workers.slowest(INITIALIZATION) > _SLOW_INITIALIZATION
         self.step_seconds = budget.fastest
         is_longest = run.status != Status.OK or (budget.spent and self._length is not None)
         self.tried_length = None if is_longest else self._length or len(run.rows) - 1

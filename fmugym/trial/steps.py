@@ -70,13 +70,10 @@ def _episodes(reference: Reference) -> tuple[tuple[int, int], ...]:
     """Which episodes to play, with their numbers of steps.
 
     After the longest ones come one that begins with a restored state, and one that begins with
-    other start values; one has no step. If initializations are precious, the first start values do
-    not come back.
+    other start values; one has no step.
     """
     longest = reference.steps
     short, long = min(_SHORT, longest), min(_LONG, longest)
-    if reference.is_frugal:
-        return ((0, short), (0, longest), (0, short), (1, long))
     return (
         *((0, short), (0, long), (0, long), (1, 0)),
         *((1, longest), (0, short), (0, longest), (0, long)),
@@ -194,9 +191,8 @@ def _beside(num_instances: int, reference: Reference) -> list[Stretch]:
     first = tuple((0, 1, 1, 0)[index % 4] for index in each)
     restored = [Stretch(_only(index, first[index], each), pause) for index in each]
     initialized = [Stretch(_only(index, 1 - first[index], each), pause) for index in each]
-    stretches = [Stretch(first, longest), Stretch(first, pause), *restored]
-    stretches += [] if reference.is_frugal else initialized
-    return [*stretches, Stretch((None,) * num_instances, longest - num_instances * pause)]
+    rest = Stretch((None,) * num_instances, longest - num_instances * pause)
+    return [Stretch(first, longest), Stretch(first, pause), *restored, *initialized, rest]
 
 
 def _only(index: int, episode: int, each: range) -> tuple[int | None, ...]:
@@ -311,38 +307,34 @@ class Played:
         return same and other.initializations <= self.initializations
 
 
-def play_rounds(pool: TriedPool, reference: Reference, *, frugal: bool) -> list[Played]:
+def play_rounds(pool: TriedPool, reference: Reference) -> list[Played]:
     """Play what rounds in threads are compared with: a first and a later episode.
 
     Args:
         pool: Two instances, stepped by one thread.
         reference: Has the start values, and how far inputs move.
-        frugal: Whether to play only the first one.
     """
-    return [Played.by(pool, reference) for _ in range(1 if frugal else 2)]
+    return [Played.by(pool, reference) for _ in range(2)]
 
 
-def is_repeated(
-    pool: TriedPool, reference: Reference, expected: Sequence[Played], *, frugal: bool
-) -> bool:
+def is_repeated(pool: TriedPool, reference: Reference, expected: Sequence[Played]) -> bool:
     """Whether two instances give the same again and again.
 
     Args:
         pool: Two instances, stepped by two threads.
         reference: As for ``play_rounds``.
         expected: What they give in one thread, first and later.
-        frugal: Whether to play as few episodes as possible.
     """
     return all(
         expected[min(number, len(expected) - 1)].allows(Played.by(pool, reference))
-        for number in _rounds(frugal)
+        for number in _rounds()
     )
 
 
-def _rounds(frugal: bool) -> Iterator[int]:
-    """A few rounds if initializations are precious, or as many as there is time for."""
+def _rounds() -> Iterator[int]:
+    """As many rounds as there is time for, and a few at least."""
     deadline, rounds = time.perf_counter() + _THREAD_SECONDS, 0
-    while rounds < _FEW_ROUNDS or not (frugal or time.perf_counter() > deadline):
+    while rounds < _FEW_ROUNDS or time.perf_counter() <= deadline:
         yield rounds
         rounds += 1
 

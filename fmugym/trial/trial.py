@@ -77,11 +77,6 @@ _METHODS: Final = {
 }
 """The reset methods, for messages."""
 
-_FRUGAL: Final = (
-    "its initializations are slow or need licences, so no episode returned to earlier start values"
-)
-"""What a trial leaves out to need fewer initializations."""
-
 
 def examine(
     fmu: FMU,
@@ -319,7 +314,6 @@ class _Trial:
         methods += [ResetMethod.RESET, ResetMethod.INSTANCE]
         methods += [ResetMethod.LIBRARY] if self.workers.can_copy_libraries else []
         grades: dict[ResetMethod, Grade] = {}
-        self.told += [_FRUGAL] * reference.is_frugal
         for method in methods:
             found = self._begins_anew(method)
             grades[method] = found.grade
@@ -332,7 +326,6 @@ class _Trial:
             resets=grades,
             noisy=reference.noisy,
             blind_start=reference.spec.blind_start,
-            is_frugal=reference.is_frugal,
         )
         return replace(verdict, components=self._components(verdict))
 
@@ -363,7 +356,7 @@ class _Trial:
         """Find a method for each component of a system that does not begin anew by restores."""
         base, parts = verdict.reset_method, self._fmu.description.components
         tried = verdict.resets.get(base) is Grade.BITWISE and base is not ResetMethod.RESTORE
-        if not tried or verdict.is_frugal or not parts:
+        if not tried or not parts:
             return ()
         offers = [offers_of(part, reloads=self.workers.can_copy_libraries) for part in parts]
         return find_component_resets(
@@ -421,7 +414,7 @@ class _Trial:
             private_libraries: Whether each instance has a copy of the library.
         """
         agree = partial(self._agree_in_turn, count=count, private_libraries=private_libraries)
-        keeps = verdict.reset_method in REUSING and not verdict.is_frugal
+        keeps = verdict.reset_method in REUSING
         return agree(verdict.reset_method, verdict.components) and (
             not keeps or agree(ResetMethod.INSTANCE)
         )
@@ -543,7 +536,7 @@ class _Trial:
         first = ResetMethod.LIBRARY if reloads else ResetMethod.INSTANCE
         for method in dict.fromkeys((first, verdict.reset_method)):
             spec = steps.spec_for_threads(given, seconds, method)
-            found = self._compared_in_threads(spec, private_libraries or reloads, verdict.is_frugal)
+            found = self._compared_in_threads(spec, private_libraries or reloads)
             if found is not None:
                 break
         else:  # not even one thread can play so
@@ -553,20 +546,18 @@ class _Trial:
         self._tell(f"two {those} in two threads{how} {{}} the same as in one", found)
         return found.is_kept
 
-    def _compared_in_threads(
-        self, spec: PoolSpec, private_libraries: bool, frugal: bool
-    ) -> Finding | None:
+    def _compared_in_threads(self, spec: PoolSpec, private_libraries: bool) -> Finding | None:
         """Compare two threads with one; returns None if one cannot play several episodes."""
         reference, stage = self._reference, "the comparison of instances in two threads"
         open_pool = partial(self.workers.pool, stage, spec, 2, private_libraries=private_libraries)
 
         def alone() -> list[Played]:
             with open_pool() as pool:
-                return steps.play_rounds(pool, reference, frugal=frugal)
+                return steps.play_rounds(pool, reference)
 
         def compare() -> Finding:
             with open_pool(threads=2) as pool:
-                same = steps.is_repeated(pool, reference, expected, frugal=frugal)
+                same = steps.is_repeated(pool, reference, expected)
             if same or not all(map(Played.allows, expected, alone())):  # or they never repeat it
                 return Finding(Grade.BITWISE, "")
             return Finding(Grade.WRONG, "some outputs differ")

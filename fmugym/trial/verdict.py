@@ -80,8 +80,6 @@ class Verdict:
         initializations: How many initializations the trial took, which may be slow.
         length: The most steps of an episode for which it holds; None if for any.
         unlimited: Whether it holds for tasks whose episodes nothing limits.
-        is_frugal: Whether fewer episodes were played, because initializations are slow or need
-            licences.
         findings: A sentence for each finding, for the log and ``fmugym info``.
     """
 
@@ -97,7 +95,6 @@ class Verdict:
     initializations: int = 0
     length: int | None = None
     unlimited: bool = True
-    is_frugal: bool = False
     findings: tuple[str, ...] = ()
 
     @property
@@ -174,7 +171,6 @@ class Verdict:
                 initializations=int(data["initializations"]),
                 length=None if data["length"] is None else int(data["length"]),
                 unlimited=bool(data["unlimited"]),
-                is_frugal=bool(data["is_frugal"]),
                 findings=tuple(map(str, data["findings"])),
             )
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):

@@ -154,10 +154,6 @@ class Workers:
         """The same as a time-out of a ``ProcessPool``."""
         return self.limit(call)[0] / _factor(call)
 
-    def slowest(self, call: str) -> float:
-        """How many seconds the slowest call of a kind has taken; 0 before the first one."""
-        return self._longest.get(_kind(call), 0.0)
-
     def note_call(self, call: str, begin: float) -> None:
         """Note a call that has begun at that time of ``time.perf_counter``."""
         kind, seconds = _kind(call), time.perf_counter() - begin
