@@ -70,7 +70,7 @@ class FMUSystem(WiredSystem):
         """Read an SSP archive. Nothing of its FMUs is executed.
 
         Nested systems become one level: a component ``plant`` of the system ``car`` is named
-        ``car.plant``. Geometry, annotations of other tools and values for parameters that do not
+        ``car.plant``. Geometry, annotations and values for parameters that do not
         exist are ignored and listed in ``findings``.
 
         Args:

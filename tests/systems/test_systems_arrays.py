@@ -58,15 +58,18 @@ def part(path, values, **options):
     return Component(path, sizes | {name: v.tolist() for name, v in values.items()}, **options)
 
 
-def plant_and_control(path, connections=None, **options):
-    """The outputs of the plant go to the controller as a whole, its answer comes by elements."""
+def plant_and_control(path, connections=None, feedthrough=False, **options):
+    """The outputs of the plant go to the controller as a whole, its answer comes by elements.
+
+    None for ``feedthrough`` leaves open whether the plant has one, as archives do.
+    """
     links = ["plant.y -> control.u"]
     links += [
         Connection("control.y[1]", "plant.u[1]"),
         Connection("control.y[2]", "plant.u[2]", GAIN, OFFSET),
     ]
     components = {
-        "plant": part(path, PLANT, feedthrough=False),
+        "plant": part(path, PLANT, feedthrough=feedthrough),
         "control": part(path, CONTROL),
     }
     return FMUSystem(components, links if connections is None else connections, **options)
@@ -325,7 +328,7 @@ observations = ["y1"]
 class TestFiles:
     def test_an_archive_has_arrays_and_sizes(self, make, path, tmp_path):
         """SSP 2.0 knows arrays; elements are connectors with names of their own."""
-        system = plant_and_control(path)
+        system = plant_and_control(path, feedthrough=None)
         again = FMUSystem.read(ssp_tools.write(system, tmp_path / "s.ssp"))
         assert again.links == system.links
         assert again.plan.components[0].sizes == system.plan.components[0].sizes

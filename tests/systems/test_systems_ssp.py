@@ -509,11 +509,7 @@ class TestDamaged:
 
     def with_parameters(self):
         own = bindings(values({"T_m_0": real(20, "degC"), "A_f": real(3)}, prefix=""))
-        steps = (
-            '<ssd:Annotations><ssc:Annotation type="fmugym"><x steps="2"/></ssc:Annotation>'
-            "</ssd:Annotations>"
-        )
-        return one_house(more=own + steps)
+        return one_house(more=own)
 
     def damaged(self, draw, root):
         for _ in range(draw.randint(1, 4)):

@@ -104,19 +104,14 @@ def write(made, path):
     parts = []
     for name, one in made.components.items():
         starts = {key: setting(value) for key, value in one.given.start_values.items()}
-        flags = {key: str(getattr(one.given, key)).lower() for key in ("isolate", "feedthrough")}
-        more = bindings(values(starts)) + note(**flags)
-        parts.append(component(name, {}, files[one.fmu.path], more))
+        parts.append(component(name, {}, files[one.fmu.path], bindings(values(starts))))
     ports = {one.name: f"{one.causality} {one.unit or ''}" for one in made.connectors}
     wires = []
     for one in made.connections:
         own = {} if one.convert_units else {"suppressUnitConversion": "true"}
         wires.append(connection(one.source, one.target, linear(one.gain, one.offset), **own))
-    names = ("master", "step_size")
-    given = {name: value for name, value in made.arguments().items() if name in names}
-    more = note(**{name: value for name, value in given.items() if value is not None})
     with zipfile.ZipFile(path, "w") as archive:
-        text = HEAD.replace("test", made.name) + system(made.name, ports, parts, wires, more) + TAIL
+        text = HEAD.replace("test", made.name) + system(made.name, ports, parts, wires) + TAIL
         archive.writestr("SystemStructure.ssd", text)
         for file, place in files.items():
             archive.write(file, place)
@@ -129,10 +124,3 @@ def setting(value):
         return f"<ssv:String value={quoteattr(value)}/>"
     sizes = "".join(f'<ssc:Dimension size="{length}"/>' for length in np.shape(value))
     return real(" ".join(map(str, np.ravel(value).tolist()))) + sizes
-
-
-def note(**own):
-    """What fmugym reads of its own in a component or system."""
-    told = "".join(f' {key}="{value}"' for key, value in own.items())
-    annotation = f'<ssc:Annotation type="fmugym"><own{told}/></ssc:Annotation>'
-    return f"<ssd:Annotations>{annotation}</ssd:Annotations>"

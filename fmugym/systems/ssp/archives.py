@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import posixpath
 import zipfile
-from collections.abc import Mapping, Set
+from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -41,7 +41,7 @@ def arguments_of(path: str | os.PathLike[str], limits: ArchiveLimits | None) -> 
     """Read an SSP archive as the arguments of an ``FMUSystem``. Nothing of its FMUs is executed.
 
     Nested systems become one level: a component ``plant`` of the system ``car`` is named
-    ``car.plant``. Geometry, annotations of other tools and values for parameters that do not exist
+    ``car.plant``. Geometry, annotations and values for parameters that do not exist
     are ignored and listed in ``findings``.
 
     Args:
@@ -94,7 +94,6 @@ class _Reader:
             "findings": [*self.archive.notes, *self.findings],
             "file": self.archive.path,
             **_experiment(root),
-            **_master(tree.own),
         }
 
     def _root(self) -> tuple[Any, Any]:
@@ -116,9 +115,6 @@ class _Reader:
                 self._fmu(element),
                 values[path],
                 element.interface,
-                _own_value(element.own, "steps", int) if "steps" in element.own else 1,
-                False if element.own.get("feedthrough") == "false" else None,
-                element.own.get("isolate") == "true",
             )
             for path, element in flat.components.items()
         }
@@ -183,27 +179,3 @@ def _experiment(root: Any) -> dict[str, float]:
     names = {"start_time": "startTime", "stop_time": "stopTime"}
     given = {} if element is None else element.attrib
     return {name: number_in(element, key) for name, key in names.items() if key in given}
-
-
-def _master(own: Mapping[str, str]) -> dict[str, Any]:
-    """What an annotation of fmugym says about the way in which a system is run."""
-    return {name: _own_value(own, name, kind) for name, kind in _OWN.items() if name in own}
-
-
-_RETIRED: Final = ("error_tolerance", "min_step_size")
-"""Which warn."""
-
-_NUMBERS: Final = ("step_size", "tolerance", "loop_tolerance", *_RETIRED)
-
-_OWN: Final[dict[str, type]] = {
-    **dict.fromkeys(("master", "loops"), str),
-    **dict.fromkeys(_NUMBERS, float),
-    "loop_iterations": int,
-}
-
-
-def _own_value(own: Mapping[str, str], name: str, kind: type) -> Any:
-    try:
-        return kind(own[name])
-    except ValueError:
-        raise FMULoadError(f"{name} is {shown(own[name])}, expected a number") from None

@@ -14,7 +14,6 @@ from fmugym.errors import FMULoadError, shown
 
 __all__ = [
     "FMU_TYPE",
-    "OWN_ANNOTATION",
     "SSD",
     "Element",
     "OwnConnector",
@@ -33,9 +32,6 @@ SSD: Final = "SystemStructure.ssd"
 """The file of an archive that describes its system."""
 
 FMU_TYPE: Final = "application/x-fmu-sharedlibrary"
-
-OWN_ANNOTATION: Final = "fmugym"
-"""The type of the annotations that say for fmugym what SSP has no words for."""
 
 _GIVES: Final = {"output", "calculatedParameter", "local", "constant"}
 _INTERFACES: Final = {
@@ -87,7 +83,6 @@ class Element:
             ``fmugym.systems.ssp.parameters`` reads.
         source: The URI of the FMU.
         interface: One of fmugym's; None for any.
-        own: The attributes of an annotation for fmugym.
     """
 
     name: str
@@ -95,7 +90,6 @@ class Element:
     bindings: list[Any]
     source: str
     interface: str | None
-    own: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -122,7 +116,7 @@ class SystemElement:
     """A system and what is in it.
 
     Attributes:
-        name, connectors, bindings, own: See ``Element``.
+        name, connectors, bindings: See ``Element``.
         elements: The components and systems by name.
         wires: The connections.
         description: For people.
@@ -133,7 +127,6 @@ class SystemElement:
     bindings: list[Any]
     elements: dict[str, Element | SystemElement]
     wires: list[Wire]
-    own: dict[str, str]
     description: str
 
 
@@ -194,29 +187,18 @@ def read_system(xml: Any, findings: list[str]) -> SystemElement:
         bindings=list(children(xml, "ParameterBindings/ParameterBinding")),
         elements=elements,
         wires=[_read_wire(one) for one in children(xml, "Connections/Connection")],
-        own=_read_own(xml),
         description=xml.get("description") or "",
     )
 
 
 def ignored(root: Any) -> list[str]:
-    """Say what of a file has no effect: annotations of other tools and geometry."""
-    types = Counter(
-        one.get("type") for one in root.iter("{*}Annotation") if one.get("type") != OWN_ANNOTATION
-    )
+    """Say what of a file has no effect: annotations and geometry."""
+    types = Counter(one.get("type") for one in root.iter("{*}Annotation"))
     shapes = Counter(one.tag.rpartition("}")[2] for one in root.iter("{*}*"))
     return [
         *(f"{n} annotations of type {shown(kind)} are ignored" for kind, n in types.items()),
         *(f"{shapes[name]} elements {name} are ignored" for name in sorted(_IGNORED & set(shapes))),
     ]
-
-
-def _read_own(xml: Any) -> dict[str, str]:
-    """What earlier versions of fmugym have written about an element, as SSP has no words for it."""
-    for annotation in children(xml, "Annotations/Annotation"):
-        if annotation.get("type") == OWN_ANNOTATION and len(annotation):
-            return dict(annotation[0].attrib)
-    return {}
 
 
 def _read_component(xml: Any, findings: list[str]) -> Element:
@@ -235,7 +217,6 @@ def _read_component(xml: Any, findings: list[str]) -> Element:
         bindings=list(children(xml, "ParameterBindings/ParameterBinding")),
         source=xml.get("source") or "",
         interface=_INTERFACES.get(wanted),
-        own=_read_own(xml),
     )
 
 
