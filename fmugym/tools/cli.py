@@ -25,7 +25,6 @@
     fmugym simulate TASK --plant [ADDRESS] [WHO] [--ahead TIME] [--speed X] [--output FILE ...]
     fmugym serve TASK [WHO] [--port N] [--speed X] [--steps N] [--seed N]
     fmugym bench TASK|model.fmu [--envs N ...] [--seconds S]
-    fmugym demo [--seed N] [--output picture.png]
 
 TASK is a task file, a registered id or ``module:Class``. WHO is ``--action random|NUMBERS``,
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
@@ -34,9 +33,9 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 ``info`` and ``new`` execute nothing of the FMU, the others do. Output is printable text; letters
 that the console lacks are escaped. The exit code is 0; 1 if something cannot be used (the error
 stream says why), ``validate`` finds an error, ``simulate`` meets a reward that is no finite number,
-``demo`` has not learned, or ``evaluate`` or ``simulate`` leave one out; 2 if the arguments are
-wrong; 130 after Ctrl-C, which keeps what was
-written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143 or 129.
+or ``evaluate`` or ``simulate`` leave one out; 2 if the arguments are wrong; 130 after Ctrl-C, which
+keeps what was written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143
+or 129.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -84,7 +83,6 @@ from typing import Any, Final, NoReturn
 import argcomplete
 
 from fmugym.errors import FMUGymError, unknown_name
-from fmugym.tools.demo import add_demo
 from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
 from fmugym.tools.fitting import add_fit
@@ -105,7 +103,7 @@ __all__ = ["main"]
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_tune),
-    *(add_fit, add_export, add_serve, add_bench, add_demo),
+    *(add_fit, add_export, add_serve, add_bench),
 )
 
 

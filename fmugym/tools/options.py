@@ -106,7 +106,6 @@ EXAMPLES: Final = {
     "serve": ("fmugym serve house.toml --controller thermostat --speed 9000 --steps 50",),
     "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 10",),
     "bench": ("fmugym bench task.toml --seconds 0.1",),
-    "demo": ("fmugym demo --output demo.png",),
 }
 """What ``--help`` shows of each command; a test finds these lines in the documents."""
 

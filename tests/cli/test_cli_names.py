@@ -11,7 +11,6 @@ from process_tools import run_python
 
 COMMANDS = [
     *("info", "new", "validate", "simulate", "train", "evaluate", "tune", "export", "bench"),
-    "demo",
 ]
 
 

@@ -100,7 +100,6 @@ POSITIONAL = {
     "tune": ("task.toml", "pid of=q setpoint=1 kp=0.1..1"),
     "fit": ("task.toml", "--log", "log.csv"),
     "export": ("agent", "--task", "task.toml", "--output", "agent.c"),
-    "demo": (),
 }
 """Arguments with which each command would begin."""
 
@@ -169,8 +168,6 @@ COMMANDS = {
     ("fit", "task.toml", "--log", "no.csv", "--parameter", "l"): ("'no.csv'", "cannot be read"),
     ("export", "nowhere", "--task", "task.toml", "--output", "a.cc"): ("'a.cc'", ".onnx"),
     ("export", "x", "--task", "task.toml", "--output", "a.c", "--fmi", "4.0"): ("--fmi", "'4.0'"),
-    ("demo", "--seed", "-1"): ("seed", "-1"),
-    ("demo", "--output", "no/x.png"): ("no/x.png", "'no'"),
     ("info", "--repair", "task.toml"): ("task.toml", "FMU"),
     ("info", "--repair", "model.fmu"): ("model.fmu", "source code"),
 }
