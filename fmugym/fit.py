@@ -41,6 +41,9 @@ _AROUND: Final = 3.0
 _WASH_IN: Final = 0.1
 """Of the shortest log, the part that is not counted if nobody says another."""
 
+_ROWS: Final = 1000
+"""How many are written."""
+
 _OFF: Final = 1e-3
 """How far from a step the rows of means may be, as a part of it."""
 
@@ -54,7 +57,6 @@ def fit_logs(
     wash_in: float | None = None,
     columns: Mapping[str, str] | None = None,
     candidates: int = 32,
-    max_evaluations: int = 100,
     advance: Callable[[float], None] = silent,
 ) -> FitResult:
     """Fit parameters of a task's FMU to logs of the plant.
@@ -75,7 +77,6 @@ def fit_logs(
             of the shortest episode, or 0 if start values are fitted.
         columns: The names of the FMU by the names of columns that differ.
         candidates: How many points within the ranges are tried first; see ``fit_parameters``.
-        max_evaluations: As for ``fit_parameters``.
         advance: Is told how many simulations of a log were done since its last call.
 
     Returns:
@@ -104,24 +105,20 @@ def fit_logs(
             plant=plant.env.inside.opening,
             advance=advance,
         )
-        return fit_of(experiment, wanted, trajectories, max_evaluations, candidates)
+        return fit_of(experiment, wanted, trajectories, candidates)
 
 
-def write_rows(
-    fit: FitResult, path: str | os.PathLike[str], *, count: int = 1000, seed: int = 0
-) -> None:
-    """Write values that fit the logs together, for the key ``fitted`` of task files.
+def write_rows(fit: FitResult, path: str | os.PathLike[str]) -> None:
+    """Write 1000 rows of values that fit the logs together, for ``fitted`` of task files.
 
     Args:
         fit: The fit.
         path: The new file, with the ending ``.npz``.
-        count: The number of rows.
-        seed: Of their draws.
 
     Raises:
         FileExistsError: If the file exists.
     """
-    rows = fit.rows(count, seed)
+    rows = fit.rows(_ROWS)
     with Path(path).open("xb") as file:
         np.savez(file, names=np.array([*fit.values]), rows=rows)
 

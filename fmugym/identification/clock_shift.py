@@ -48,9 +48,7 @@ class Shift(NamedTuple):
     improvement: float
 
 
-def shift_of_clocks(
-    fit: FitResult, trajectories: Sequence[Trajectory], max_evaluations: int
-) -> Shift | None:
+def shift_of_clocks(fit: FitResult, trajectories: Sequence[Trajectory]) -> Shift | None:
     """Estimate a shift of clocks, if it explains more than half of the squares of residuals.
 
     Values are fitted again with the outputs at other times, since a wrong shift distorts them.
@@ -58,7 +56,6 @@ def shift_of_clocks(
     Args:
         fit: A fit whose residuals are no noise.
         trajectories: What it was fitted to.
-        max_evaluations: As for ``fit_parameters``.
 
     Returns:
         The shift; None if there is none, or no input tells of it.
@@ -79,7 +76,7 @@ def shift_of_clocks(
         seconds = float(np.clip(last + np.clip(gain, 1.0, _LARGEST_GAIN) * change, -most, most))
         step = seconds - last
         try:
-            found = _fitted(fit, found, trajectories, seconds, max_evaluations)
+            found = _fitted(fit, found, trajectories, seconds)
         except (ConfigError, SimulationError):  # too few rows are left, or the FMU fails
             return None
     ratio = _size(found.comparison) / _size(fit.comparison)
@@ -93,15 +90,12 @@ def _fitted(
     last: FitResult,
     trajectories: Sequence[Trajectory],
     seconds: float,
-    max_evaluations: int,
 ) -> FitResult:
     """Fit from the last values on, with the outputs as they were some seconds earlier."""
     limits = {n: (v, *fit.bounds[n]) for n, v in last.values.items()}
     wash_in = max(fit.experiment.wash_in or 0.0, -seconds)
     experiment = replace(fit.experiment, wash_in=wash_in)
-    return fit_of(
-        experiment, limits, [_moved(t, seconds) for t in trajectories], max_evaluations, 1
-    )
+    return fit_of(experiment, limits, [_moved(t, seconds) for t in trajectories], 1)
 
 
 def _moved(trajectory: Trajectory, seconds: float) -> Trajectory:

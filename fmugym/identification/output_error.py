@@ -19,12 +19,10 @@ import numpy as np
 
 from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.checks import (
-    check_flag,
     check_integer,
     check_mapping,
     check_number,
     check_seed,
-    check_text,
 )
 from fmugym.distributions import Column
 from fmugym.errors import ConfigError
@@ -185,18 +183,11 @@ class FitResult:
     def predict(
         self,
         trajectories: Sequence[Trajectory],
-        *,
-        refit_initial_states: bool = True,
-        lead_in: float | None = None,
     ) -> Comparison:
-        """Simulate other trajectories with the fitted values.
+        """Simulate other trajectories with the fitted values, and fit their initial states.
 
         Args:
             trajectories: Held-out measurements, with the same outputs and inputs.
-            refit_initial_states: Whether to fit the initial state of each trajectory to its
-                samples. Otherwise the first sample gives the initial state.
-            lead_in: How many seconds of samples the refit uses. The rest is then a prediction in
-                the strict sense. None for all samples.
 
         Returns:
             Measured and simulated outputs.
@@ -205,13 +196,8 @@ class FitResult:
             ConfigError: If an argument has a wrong type or range.
             SimulationError: If the FMU fails.
         """
-        refit_initial_states = check_flag("refit_initial_states", refit_initial_states)
-        if lead_in is not None:
-            lead_in = check_number("lead_in", lead_in, positive=True, may_be_infinite=True)
         experiment, shifted = self._for_prediction(trajectories)
-        if lead_in is not None and refit_initial_states:
-            experiment = replace(experiment, lead_in=lead_in)
-        with closing(Problem(experiment, {}, shifted, refit_initial_states)) as problem:
+        with closing(Problem(experiment, {}, shifted)) as problem:
             return problem.compare(problem.start)
 
     def _for_prediction(
@@ -232,15 +218,11 @@ def fit_parameters(
     trajectories: Sequence[Trajectory],
     *,
     initial_states: Mapping[str, str | float] | None = None,
-    fit_initial_states: bool = True,
     fixed: Mapping[str, float | str] | None = None,
     scales: Mapping[str, float] | None = None,
     time_step: float | None = None,
     wash_in: float | None = None,
     candidates: int = 1,
-    drop_repeats: bool = True,
-    max_evaluations: int = 100,
-    backend: str = "auto",
 ) -> FitResult:
     """Fit parameters of an FMU to logged trajectories.
 
@@ -257,9 +239,8 @@ def fit_parameters(
             The name of an input stands for a constant that is added to the input.
         trajectories: The measurements. Simulated time begins at 0 in each of them.
         initial_states: The FMU's start parameters of the states. Each has the name of the output
-            that measures the state, or a number. None if the FMU's own start values are right.
-        fit_initial_states: Whether to fit the initial states of each trajectory too. Otherwise the
-            first samples give them.
+            that measures the state, or a number, where its fit begins. None if the FMU's own start
+            values are right.
         fixed: Values of other parameters by name.
         scales: Standard deviation of the noise of each output, in its unit. Only the ratios
             matter. Without it, an output is weighted by the noise that its residuals show, at
@@ -269,9 +250,6 @@ def fit_parameters(
             initial state is forgotten; 0 leaves out the first sample. None counts all.
         candidates: How many points within the bounds, the start among them, are tried at once. The
             fit begins at the three best ones.
-        drop_repeats: Whether to drop stale samples first; see ``Trajectory.without_repeats``.
-        max_evaluations: Largest number of evaluations of the optimization.
-        backend: See ``fmugym.pool.wishes.Wishes``.
 
     Returns:
         Values, standard errors, and the comparison of measurement and simulation.
@@ -291,12 +269,10 @@ def fit_parameters(
         _mapping("fixed", fixed),
         _mapping("scales", scales),
         time_step,
-        check_flag("drop_repeats", drop_repeats),
-        check_text("backend", backend),
-        wash_in,
+        drop_repeats=True,
+        wash_in=wash_in,
     )
-    fit_states = check_flag("fit_initial_states", fit_initial_states)
-    return fit_of(experiment, wanted, trajectories, max_evaluations, candidates, fit_states)
+    return fit_of(experiment, wanted, trajectories, candidates)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
@@ -307,15 +283,12 @@ def fit_of(
     experiment: Experiment,
     parameters: Mapping[str, Limits],
     trajectories: Sequence[Trajectory],
-    max_evaluations: int,
     candidates: int,
-    fit_states: bool = True,
 ) -> FitResult:
     """Fit with these settings; see ``fit_parameters``."""
-    max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
     candidates = check_integer("candidates", candidates, 1, 10**6)
-    with closing(Problem(experiment, parameters, trajectories, fit_states)) as problem:
-        solution, costs = problem.solve(max_evaluations, candidates)
+    with closing(Problem(experiment, parameters, trajectories)) as problem:
+        solution, costs = problem.solve(candidates)
         return FitResult(
             values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
             **problem.uncertainty(solution),

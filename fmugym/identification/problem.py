@@ -41,6 +41,9 @@ DIFFERENCE = 1e-6
 FAILED = 1e3
 """Residual of a failed simulation, in units of the scale; it keeps the optimizer away."""
 
+MOST_EVALUATIONS = 100
+"""Largest number of evaluations of an optimization."""
+
 MAX_ITERATIONS = 50
 """Largest number of iterations in the fit of the initial states."""
 
@@ -98,7 +101,6 @@ class Problem:
         experiment: The settings.
         parameters: The parameters to fit; see ``fit_parameters``.
         trajectories: The measured trajectories.
-        fit_states: Whether to fit the initial states.
 
     Attributes:
         trajectories: The trajectories without stale samples.
@@ -111,7 +113,6 @@ class Problem:
         experiment: Experiment,
         parameters: Mapping[str, Limits],
         trajectories: Sequence[Trajectory],
-        fit_states: bool = True,
     ) -> None:
         outputs, _ = common_names(trajectories)
         repeats = not experiment.drop_repeats
@@ -120,7 +121,7 @@ class Problem:
         self._states = _measured_states(experiment.initial_states, self.trajectories)
         self._counted = [_counted(t, experiment) for t in self.trajectories]
         names = [*parameters, *self._state_names]
-        self._rows = range(len(names) if fit_states else len(parameters))
+        self._rows = range(len(names))
         variables = [_settable(experiment, name) for name in names]
         self._set_limits(variables, parameters)
         self._scales = _scales(experiment.scales, self.trajectories, outputs)
@@ -143,11 +144,10 @@ class Problem:
         """Free the simulator."""
         self._simulator.close()
 
-    def solve(self, max_evaluations: int, candidates: int = 1) -> tuple[Any, list[float]]:
+    def solve(self, candidates: int = 1) -> tuple[Any, list[float]]:
         """Minimize the residuals from several starts.
 
         Args:
-            max_evaluations: For each start.
             candidates: Points within the bounds, of which the best ones are starts.
 
         Returns:
@@ -161,7 +161,7 @@ class Problem:
         measured, found = self._states, []
         for start in self._starts(candidates):
             self._states = measured
-            found.append((self._descend(start, max_evaluations), self._states))
+            found.append((self._descend(start), self._states))
         found.sort(key=lambda one: one[0].cost)
         solution, self._states = found[0]
         spread, costs = self._scales, [float(one.cost) for one, _ in found]
@@ -169,7 +169,7 @@ class Problem:
             noise = np.sqrt(np.mean(self._series(solution.fun) ** 2, axis=0)) * self._scales
             noise = np.maximum(noise, LEAST_NOISE * spread)
             self._scales = np.where(self._given, self._scales, noise)
-            solution = self._descend(solution.x, max_evaluations)
+            solution = self._descend(solution.x)
         return solution, costs
 
     def _require_samples(self) -> None:
@@ -210,7 +210,7 @@ class Problem:
         found = np.concatenate(costs)
         return np.where(np.isfinite(found), found, np.inf)
 
-    def _descend(self, start: FloatArray, max_evaluations: int) -> Any:
+    def _descend(self, start: FloatArray) -> Any:
         """Minimize the residuals from a start."""
         count = len(self.start)
         return imported("scipy.optimize", "identification").least_squares(
@@ -219,7 +219,7 @@ class Problem:
             jac=self._jacobian,
             bounds=(self._low[:count], self._high[:count]),
             x_scale="jac",
-            max_nfev=max_evaluations,
+            max_nfev=MOST_EVALUATIONS,
         )
 
     def compare(self, parameters: FloatArray, *, refit: bool = True) -> Comparison:
@@ -227,7 +227,7 @@ class Problem:
 
         Args:
             parameters: Their values, shape (k,).
-            refit: Whether to fit the initial states, if the problem fits them.
+            refit: Whether to fit the initial states.
         """
         values = self._fit_states(parameters)[0] if refit else self._states
         simulated = self._simulator.simulate(self._join(parameters, values))
@@ -412,10 +412,10 @@ def start_between(value: float, low: float, high: float) -> float:
 
 
 def _counted(trajectory: Trajectory, experiment: Experiment) -> MaskArray:
-    """Which samples of a trajectory count: those after the wash-in, and within the lead-in."""
+    """Which samples of a trajectory count: those after the wash-in."""
     since, wash_in = trajectory.time - trajectory.time[0], experiment.wash_in
     begin = -1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0)
-    counted = (since > begin) & (since < experiment.lead_in)
+    counted = since > begin
     if not counted.any():
         raise ConfigError(f"a log of {since[-1]:g} s has no samples after a wash-in of {begin:g} s")
     return np.asarray(counted)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -39,7 +38,7 @@ def silent(count: float) -> None:
 class Experiment:
     """The common settings of a fit and its predictions; see ``fit_parameters``.
 
-    ``lead_in`` is how many seconds of samples count. ``plant`` is how an environment opens the FMU,
+    ``plant`` is how an environment opens the FMU,
     if one does; its communication steps, samplings and start time hold then. ``advance`` is told
     how many simulations were done since its last call.
     """
@@ -50,9 +49,7 @@ class Experiment:
     scales: Mapping[str, float] = field(default_factory=dict)
     time_step: float | None = None
     drop_repeats: bool = False
-    backend: str = "auto"
     wash_in: float | None = None
-    lead_in: float = math.inf
     plant: PoolOpening | None = None
     advance: Callable[[float], None] = silent
 
@@ -106,7 +103,7 @@ class Simulator:
         spec = PoolSpec(inputs, outputs, step)
         count = num_sets * len(trajectories)
         if plant is None:
-            self._pool = make_pool(fmu, spec, count, logger, backend=experiment.backend)
+            self._pool = make_pool(fmu, spec, count, logger)
         else:
             self._pool = replace(plant, fmu=fmu, spec=_as_in(plant.spec, spec)).open(count)
 

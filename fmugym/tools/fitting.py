@@ -34,8 +34,6 @@ from fmugym.tools.targets import maker_of
 
 __all__ = ["add_fit"]
 
-_EVALUATIONS: Final = 100
-
 _RELATED: Final = 0.95
 """Correlations of parameters above this are worth a line."""
 
@@ -152,7 +150,7 @@ def _start(text: str) -> tuple[str, str | None]:
 
 def _show(fit: FitResult, arguments: argparse.Namespace) -> None:
     is_noise = all(one.is_noise for one in fit.correlations.values())
-    shift = None if is_noise else shift_of_clocks(fit, fit.comparison.trajectories, _EVALUATIONS)
+    shift = None if is_noise else shift_of_clocks(fit, fit.comparison.trajectories)
     facts = _facts(fit) | {"shift": None if shift is None else shift._asdict()}
     say_result(arguments, facts, "\n".join(_table(fit)))
     for one in ([] if shift is None else [_told(shift)]) + _warnings(fit, shift is not None):

@@ -141,7 +141,7 @@ class TestConversion:
             np.zeros(8),
         )
         values = [
-            fit_logs(make, [log], {"T_start": (18, 24)}, max_evaluations=3, candidates=2).values
+            fit_logs(make, [log], {"T_start": (18, 24)}, candidates=2).values
             for make in (lambda: house(path, variables=UNITS), house)
         ]
         assert 291 <= values[0]["T_m_0"] <= 298

@@ -145,7 +145,6 @@ class TestEnvironments:
             two_houses(),
             {"east.A_f": (150.0, 100.0, 200.0)},
             [trajectory],
-            fit_initial_states=False,
         )
         assert fit.values["east.A_f"] == pytest.approx(140.0, rel=1e-3)
 

@@ -23,15 +23,11 @@ FIT = {
     "parameters": {"l": (0.05, 0.2)},
     "trajectories": [Trajectory(TIME, SWING)] * 3,
     "initial_states": {"q_0": "q"},
-    "fit_initial_states": False,
     "fixed": {"g": 9.81},
     "scales": {"q": 1.0},
     "time_step": 0.02,
     "wash_in": 0.1,
     "candidates": 1,
-    "drop_repeats": True,
-    "max_evaluations": 2,
-    "backend": "auto",
 }
 INSIDE = ("parameters", "initial_states", "fixed", "scales")
 
@@ -65,12 +61,7 @@ def method(rng, folder):
     calls = (
         *(made.select, made.windows, lambda x: made.between(x, 1.0), fitted().confidence_intervals),
         *(lambda x: made.between(0.0, x), fitted().rms, fitted().predict, fitted().rows),
-        *(lambda x: fitted().predict([made], lead_in=x), fitted().comparison.residuals),
-        *(lambda x: fitted().predict([made], refit_initial_states=x), fitted().distributions),
-        *(lambda x: fitted().comparison.rms_interval("q", x),),
-        *(lambda x: fitted().comparison.rms_interval("q", seed=x), plot_comparison),
-        *(lambda x: plot_comparison(fitted().comparison, x),),
-        *(lambda x: plot_comparison(fitted().comparison, labels=x),),
+        *(fitted().comparison.residuals, fitted().distributions, plot_comparison),
     )
     call = rng.choice(calls)
     return lambda: call(value)
