@@ -30,6 +30,12 @@ __all__ = ["check_fmu_env", "check_hooks"]
 logger = logging.getLogger(__name__)
 
 
+_SEED: Final = 0
+"""Of the episodes and of the actions."""
+
+_NUM_STEPS: Final = 200
+"""Length of each trial."""
+
 _SHORT_EPISODE: Final = 3
 """In steps."""
 
@@ -51,25 +57,24 @@ class _Start:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
 
-def check_fmu_env(env: gymnasium.Env[Any, Any], seed: int = 0, num_steps: int = 200) -> None:
+def check_fmu_env(env: gymnasium.Env[Any, Any]) -> None:
     """Check that an environment over an FMU keeps its contract.
 
     The checks run on copies, made from the class and the arguments of its constructor. The
     environment itself is not used.
 
     Args:
-        env: The environment, wrapped or not.
-        seed: Seeds the episodes and the actions.
-        num_steps: Length of each trial in steps. When an episode ends, another follows.
+        env: The environment, wrapped or not. Each check makes 200 steps with random actions. When
+            an episode ends, another follows.
 
     Raises:
         ContractError: If the environment breaks the contract; the text says how.
         ConfigError: If it is not an environment of fmugym.
     """
     inner = inner_env(env)
-    actions = _sample_actions(inner, seed, num_steps)
+    actions = _sample_actions(inner, _NUM_STEPS)
     for check in _CHECKS:
-        check(inner, actions, seed)
+        check(inner, actions)
 
 
 def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any) -> None:
@@ -99,9 +104,9 @@ def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any)
         raise ContractError(f"{type(inner).__name__}: {difference}. {CURE}")
 
 
-def _sample_actions(env: FMUEnv, seed: int, count: int) -> list[Any]:
+def _sample_actions(env: FMUEnv, count: int) -> list[Any]:
     space = copy.deepcopy(env.action_space)
-    space.seed(seed)
+    space.seed(_SEED)
     return [space.sample() for _ in range(count)]
 
 
@@ -116,10 +121,10 @@ def _fresh(env: FMUEnv) -> Iterator[FMUEnv]:
         fresh.close()
 
 
-def _rollout(env: FMUEnv, actions: list[Any], seed: int) -> list[_Transition]:
+def _rollout(env: FMUEnv, actions: list[Any]) -> list[_Transition]:
     """Run episodes one after another; only the first is seeded."""
     transitions: list[_Transition] = []
-    start, played = _Start(seed), 0
+    start, played = _Start(_SEED), 0
     while played < len(actions):
         episode = _episode(env, actions[played:], start)
         transitions += episode
@@ -152,21 +157,21 @@ def _require_equal(what: str, first: list[_Transition], second: list[_Transition
         raise ContractError(f"{what}: the episodes end at different steps")
 
 
-def _check_determinism(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_determinism(env: FMUEnv, actions: list[Any]) -> None:
     with _fresh(env) as first, _fresh(env) as second:
         _require_equal(
             "two environments with the same seed and actions differ",
-            _rollout(first, actions, seed),
-            _rollout(second, actions, seed),
+            _rollout(first, actions),
+            _rollout(second, actions),
         )
 
 
-def _check_reset(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_reset(env: FMUEnv, actions: list[Any]) -> None:
     """Compare episodes of one environment with those of fresh ones, as the trial of an FMU does.
 
     Episodes follow short and long ones, with the same start values as before and with others.
     """
-    starts = _Start(seed), _other_start(env, actions, seed)
+    starts = _Start(_SEED), _other_start(env, actions)
     references = [_fresh_episode(env, actions, start) for start in starts]
     short, long = min(_SHORT_EPISODE, len(actions)), len(actions)
     with _fresh(env) as tried:
@@ -181,24 +186,24 @@ def _fresh_episode(env: FMUEnv, actions: list[Any], start: _Start) -> list[_Tran
         return _episode(fresh, actions, start)
 
 
-def _other_start(env: FMUEnv, actions: list[Any], seed: int) -> _Start:
+def _other_start(env: FMUEnv, actions: list[Any]) -> _Start:
     """Another seed and, if the FMU runs with them, parameters that differ by one percent."""
     with _fresh(env) as tried:
-        tried.reset(seed=seed)
+        tried.reset(seed=_SEED)
         changed = {n: _changed(tried, n, value) for n, value in tried.parameters.items()}
         start = _Start(
-            seed + 1, {name: value for name, value in changed.items() if value is not None}
+            _SEED + 1, {name: value for name, value in changed.items() if value is not None}
         )
         try:
             _episode(tried, actions, start)
         except FMUGymError:
-            return _Start(seed + 1)
+            return _Start(_SEED + 1)
         return start
 
 
-def _check_results(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_results(env: FMUEnv, actions: list[Any]) -> None:
     with _fresh(env) as tried:
-        for transition in _rollout(tried, actions, seed):
+        for transition in _rollout(tried, actions):
             _require_type("reward", transition.reward, float)
             _require_type("terminated", transition.terminated, bool)
             _require_type("truncated", transition.truncated, bool)
@@ -217,9 +222,9 @@ def _require_type(what: str, value: Any, expected: type) -> None:
         )
 
 
-def _check_time(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_time(env: FMUEnv, actions: list[Any]) -> None:
     with _fresh(env) as tried:
-        tried.reset(seed=seed)
+        tried.reset(seed=_SEED)
         start, step = tried.time, tried.inside.interface.time_step
         for count, action in enumerate(actions, start=1):
             *_, terminated, truncated, _ = tried.step(action)
@@ -230,22 +235,22 @@ def _check_time(env: FMUEnv, actions: list[Any], seed: int) -> None:
                 return
 
 
-def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_parameters(env: FMUEnv, actions: list[Any]) -> None:
     """A parameter must have the value that was set, and another value must have an effect.
 
     Strings are left out: FMUs need not be able to tell them.
     """
     with _fresh(env) as tried:
-        tried.reset(seed=seed)
+        tried.reset(seed=_SEED)
         given = {n: v for n, v in tried.parameters.items() if not isinstance(v, str)}
         read = tried.read_variables(*given)
         for name, value in given.items():
             if not math.isclose(read[name], value, rel_tol=1e-6):
                 raise ContractError(f"parameter {name!r} was set to {value}, but is {read[name]}")
-        before = _trace(tried, actions, seed, {})
+        before = _trace(tried, actions, {})
         for name, value in given.items():
             changed = _changed(tried, name, value)
-            if changed is not None and _trace(tried, actions, seed, {name: changed}) == before:
+            if changed is not None and _trace(tried, actions, {name: changed}) == before:
                 logger.warning(
                     "parameter %r has no effect on the outputs: %g gives the same as %g",
                     name,
@@ -270,10 +275,10 @@ def _changed(env: FMUEnv, name: str, value: float) -> float | None:
 
 
 def _trace(
-    env: FMUEnv, actions: list[Any], seed: int, parameters: dict[str, float]
+    env: FMUEnv, actions: list[Any], parameters: dict[str, float]
 ) -> list[tuple[float, ...]]:
     """Return the outputs of one episode."""
-    env.reset(seed=seed, options={"model_parameters": parameters})
+    env.reset(seed=_SEED, options={"model_parameters": parameters})
     trace = [env.state]
     for action in actions:
         *_, terminated, truncated, _ = env.step(action)
@@ -283,10 +288,10 @@ def _trace(
     return trace
 
 
-def _check_hooks(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_hooks(env: FMUEnv, actions: list[Any]) -> None:
     """A second call of a hook after a step must return the same and change nothing."""
     with _fresh(env) as tried:
-        tried.reset(seed=seed)
+        tried.reset(seed=_SEED)
         for action in actions[:20]:
             observation, reward, terminated, truncated, _ = tried.step(action)
             if terminated or truncated:
@@ -324,9 +329,9 @@ def _shares_memory(first: Any, second: Any) -> bool:
     return both and np.shares_memory(first, second)
 
 
-def _check_close(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_close(env: FMUEnv, actions: list[Any]) -> None:
     with _fresh(env) as tried:
-        tried.reset(seed=seed)
+        tried.reset(seed=_SEED)
         tried.close()
         tried.close()
 

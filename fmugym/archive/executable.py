@@ -48,16 +48,13 @@ _UNIVERSAL: Final = {
 _MOST_SLICES: Final = 64
 
 
-def check_library(
-    file: BinaryIO, size: int, name: str, architecture: str = fmpy.architecture
-) -> None:
-    """Check the headers of a shared library.
+def check_library(file: BinaryIO, size: int, name: str) -> None:
+    """Check the headers of a shared library, which must be for the processor of this process.
 
     Args:
         file: The library, seekable, at its beginning.
         size: Its length in bytes.
         name: Its file name; the suffix tells which system it must be for.
-        architecture: The processor it must be for, in FMPy's naming.
 
     Raises:
         FMULoadError: If it is not a shared library, cut short, or for another system or processor.
@@ -68,7 +65,7 @@ def check_library(
     if found != suffix:
         what = "not a shared library" if found is None else f"a library of {_SYSTEMS[found]}"
         raise FMULoadError(f"{name} is {what}, expected one of {_SYSTEMS[suffix]}")
-    _CHECKS[suffix](BinaryFile(file, size, name), architecture)
+    _CHECKS[suffix](BinaryFile(file, size, name), fmpy.architecture)
 
 
 def _require_shared(source: BinaryFile, shared: bool) -> None:

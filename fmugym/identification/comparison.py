@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fmugym.checks import check_option
+from fmugym.checks import check_mapping, check_option, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
@@ -54,28 +55,30 @@ class Comparison:
         return 1.0 - self.rms(output) ** 2 / (float(np.var(measured)) or 1.0)
 
 
-def plot_comparison(comparison: Comparison) -> Figure:
+def plot_comparison(comparison: Comparison, labels: Mapping[str, str] | None = None) -> Figure:
     """Plot measured and simulated outputs over time, one below the other.
 
     Args:
         comparison: The result of a fit or a prediction.
+        labels: Names with units for the axes, by output.
 
     Returns:
         A figure of matplotlib. ``figure.savefig(path)`` saves it.
 
     Raises:
-        ConfigError: If it is something else.
+        ConfigError: If an argument has a wrong type.
     """
     from fmugym.figures import Figure
 
     if not isinstance(comparison, Comparison):
         raise ConfigError(f"expected a Comparison, not {shown(comparison)}")
     outputs = list(comparison.trajectories[0].outputs)
+    texts = {} if labels is None else check_mapping("labels", labels)
     figure = Figure(figsize=(8, 1 + 2 * len(outputs)), layout="constrained")
     axes = figure.subplots(len(outputs), sharex=True, squeeze=False)[:, 0]
     for ax, output in zip(axes, outputs, strict=True):
         _draw_output(ax, comparison, output)
-        ax.set_ylabel(output)
+        ax.set_ylabel(check_text("labels", texts.get(output, output)))
     axes[0].legend(loc="upper right")
     axes[-1].set_xlabel("time [s]")
     return figure

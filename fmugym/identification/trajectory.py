@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_mapping, check_number, check_text
+from fmugym.checks import check_mapping, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 
@@ -70,38 +70,6 @@ class Trajectory:
         outputs = {name: values[rows] for name, values in self.outputs.items()}
         inputs = {name: values[rows] for name, values in self.inputs.items()}
         return Trajectory(self.time[rows], outputs, inputs, self.label)
-
-    def between(self, start: float, end: float) -> Trajectory:
-        """Return the samples with ``start <= time < end``, in seconds.
-
-        Raises:
-            ConfigError: If there are fewer than two such samples.
-        """
-        start = check_number("start", start, may_be_infinite=True)
-        end = check_number("end", end, may_be_infinite=True)
-        chosen = (self.time >= start) & (self.time < end)
-        if chosen.sum() < 2:
-            raise ConfigError(
-                f"there are fewer than two samples between {start:g} and {end:g} s; "
-                f"the trajectory has {self.time[0]:g} to {self.time[-1]:g} s"
-            )
-        return self.select(chosen)
-
-    def windows(self, length: float) -> list[Trajectory]:
-        """Cut the trajectory into consecutive windows, and drop an incomplete one at the end.
-
-        Args:
-            length: Length of each window in seconds.
-
-        Raises:
-            ConfigError: If a window would have fewer than two samples.
-        """
-        length = check_number("length", length, positive=True)
-        start, period = self.time[0], (self.time[-1] - self.time[0]) / (len(self) - 1)
-        if length < period:
-            raise ConfigError(f"windows of {length:g} s are shorter than the period {period:g} s")
-        count = int((self.time[-1] - start + period) / length + 1e-9)
-        return [self.between(start + i * length, start + (i + 1) * length) for i in range(count)]
 
     def without_repeats(self) -> Trajectory:
         """Drop stale samples, whose outputs all equal those of the sample before.

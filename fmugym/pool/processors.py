@@ -6,8 +6,12 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+from typing import Final
 
 __all__ = ["available_processors", "processor_quota"]
+
+_ROOT: Final = Path("/")
+"""The folder with ``proc`` and ``sys``."""
 
 
 def available_processors() -> int:
@@ -23,37 +27,34 @@ def available_processors() -> int:
     return max(1, math.ceil(min(processors, processor_quota())))
 
 
-def processor_quota(root: Path = Path("/")) -> float:
+def processor_quota() -> float:
     """The processors that the control groups of this process allow; inf if there is no limit.
 
     The limits of all groups count that contain the process, for cgroup v1 and v2. Groups that
     cannot be read count as groups without a limit.
-
-    Args:
-        root: The folder with ``proc`` and ``sys``.
     """
     quotas = [math.inf]
-    for controllers, group in _groups(root):
+    for controllers, group in _groups():
         quota = _quota_v1 if controllers else _quota_v2
-        quotas.extend(map(quota, _folders(root, controllers, group)))
+        quotas.extend(map(quota, _folders(controllers, group)))
     return min(quotas)
 
 
-def _groups(root: Path) -> Iterator[tuple[str, PurePosixPath]]:
+def _groups() -> Iterator[tuple[str, PurePosixPath]]:
     """The controllers (empty in cgroup v2) and the path of each group that may limit processors."""
-    for line in _read(root / "proc/self/cgroup").splitlines():
+    for line in _read(_ROOT / "proc/self/cgroup").splitlines():
         _, _, rest = line.partition(":")
         controllers, _, path = rest.partition(":")
         if not controllers or "cpu" in controllers.split(","):
             yield controllers, PurePosixPath(path)
 
 
-def _folders(root: Path, controllers: str, group: PurePosixPath) -> Iterator[Path]:
+def _folders(controllers: str, group: PurePosixPath) -> Iterator[Path]:
     """The folders of a group and of those around it.
 
     In a container only the last one, the folder of all groups, may be there.
     """
-    top = root / "sys/fs/cgroup" / controllers
+    top = _ROOT / "sys/fs/cgroup" / controllers
     parts = [part for part in group.parts if part not in ("/", "..")]
     for count in range(len(parts), -1, -1):
         yield top.joinpath(*parts[:count])

@@ -34,7 +34,10 @@ def library(folder):
 
 
 def check(content, suffix, architecture):
-    check_library(io.BytesIO(content), len(content), f"some{suffix}", architecture)
+    """As a process does that runs on this architecture."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fmpy, "architecture", architecture)
+        check_library(io.BytesIO(content), len(content), f"some{suffix}")
 
 
 def refused(content, suffix, architecture, match):

@@ -168,8 +168,9 @@ class TestQuota:
             ({"proc/self/cgroup": "nonsense\n\n:::", "sys/fs/cgroup/cpu.max": "a b c"}, np.inf),
         ],
     )
-    def test_of_control_groups(self, tmp_path, files, expected):
-        assert processor_quota(self.write(tmp_path, files)) == expected
+    def test_of_control_groups(self, tmp_path, monkeypatch, files, expected):
+        monkeypatch.setattr("fmugym.pool.processors._ROOT", self.write(tmp_path, files))
+        assert processor_quota() == expected
 
     @pytest.mark.parametrize(("quota", "expected"), [(np.inf, 8), (3.0, 3), (1.5, 2), (0.1, 1)])
     def test_counts_as_processors_do(self, monkeypatch, quota, expected):

@@ -280,7 +280,7 @@ def test_fmugym_new_knows_elements(state_space, tmp_path, words, ran):
 
 def test_the_contract(state_space):
     env = state_space_env(state_space, model_parameters={"A": [[-1, 0.5], [0, -2]]})
-    check_fmu_env(env, num_steps=20)
+    check_fmu_env(env)
 
 
 @pools

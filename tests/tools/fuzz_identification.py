@@ -59,9 +59,9 @@ def method(rng, folder):
     """Call a method of a result or of a trajectory with one odd argument."""
     made, value = FIT["trajectories"][0], odd(rng)
     calls = (
-        *(made.select, made.windows, lambda x: made.between(x, 1.0), fitted().confidence_intervals),
-        *(lambda x: made.between(0.0, x), fitted().rms, fitted().predict, fitted().rows),
-        *(fitted().comparison.residuals, fitted().distributions, plot_comparison),
+        *(made.select, fitted().confidence_intervals, fitted().rms, fitted().predict),
+        *(fitted().comparison.residuals, fitted().rows, fitted().distributions, plot_comparison),
+        *(lambda x: plot_comparison(fitted().comparison, x),),
     )
     call = rng.choice(calls)
     return lambda: call(value)
