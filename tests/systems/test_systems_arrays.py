@@ -12,7 +12,6 @@ from system_tools import (
     closing_pools,  # noqa: F401  # the fixture "make"
     play,
 )
-from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import (
@@ -210,10 +209,6 @@ class TestOwnArrays:
         assert env.out["plant.x[2]"] == pytest.approx(x[1], abs=1e-7)
         env.close()
 
-    def test_vector_environments_do_as_single_ones(self, path):
-        system = own_arrays(path)
-        require_same_alone(lambda: Plant(system), 4)
-
     def test_an_element_is_an_input_by_itself(self, path):
         """In a system, the other elements keep what they have, also a start value of the config."""
         env = Plant(
@@ -334,11 +329,6 @@ class TestFiles:
         assert again.plan.components[0].sizes == system.plan.components[0].sizes
         rows = [play(make(one, (), STATES), 5) for one in (system, again)]
         assert rows[0].tobytes() == rows[1].tobytes()
-
-    def test_own_arrays_come_back(self, path, tmp_path):
-        system = own_arrays(path)
-        again = FMUSystem.read(ssp_tools.write(system, tmp_path / "s.ssp"))
-        assert again.connectors == system.connectors
 
     def test_a_task_file_has_arrays(self, path, tmp_path):
         task = tmp_path / "task.toml"
