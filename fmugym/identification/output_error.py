@@ -113,9 +113,9 @@ class FitResult:
         factor, errors = self.factor(level), self.standard_errors
         return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
 
-    def distributions(self, count: int = 1000, seed: int | None = 0) -> dict[str, Column]:
-        """Return the values as parameters of which each episode draws a row; see ``rows``."""
-        columns = zip(self.values, self.rows(count, seed).T.tolist(), strict=True)
+    def distributions(self) -> dict[str, Column]:
+        """Return the values as parameters of which each episode draws one of 1000 ``rows``."""
+        columns = zip(self.values, self.rows(1000).T.tolist(), strict=True)
         return {name: Column(values, table="fit") for name, values in columns}
 
     def untold(self) -> list[dict[str, float]]:

@@ -181,7 +181,7 @@ class TestOutputError:
         options = {"initial_states": START, "fixed": {"c": 2e-3}}
         fit = fit_parameters(PENDULUM, {"l": (0.11, 0.2)}, noisy(1, 2.0), **options)
         assert fit.values["l"] == pytest.approx(0.11)
-        found = fit.distributions(50)["l"].values
+        found = fit.distributions()["l"].values
         assert 0.11 <= min(found) < max(found) <= 0.2
 
     def test_the_result_goes_into_an_environment(self, fit):

@@ -60,7 +60,7 @@ def method(rng, folder):
     made, value = FIT["trajectories"][0], odd(rng)
     calls = (
         *(made.select, fitted().confidence_intervals, fitted().rms, fitted().predict),
-        *(fitted().comparison.residuals, fitted().rows, fitted().distributions, plot_comparison),
+        *(fitted().comparison.residuals, fitted().rows, plot_comparison),
         *(lambda x: plot_comparison(fitted().comparison, x),),
     )
     call = rng.choice(calls)
