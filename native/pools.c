@@ -88,7 +88,13 @@ static bool load_libraries(Pool *pool, char *error, size_t size) {
 /* Appends what the FMU said. If that is too long, only its end is kept. */
 static void explain_refusal(Pool *pool, size_t index, char *error, size_t size) {
     char *said = log_said(&pool->log, index);
-    const size_t length = (size_t)snprintf(error, size, "it refused to be instantiated" LOG_SAID);
+    char number[64] = "";
+
+    if (index > 0) {
+        snprintf(number, sizeof number, " as number %zu of %zu", index + 1, pool->settings.count);
+    }
+    const size_t length =
+        (size_t)snprintf(error, size, "it refused to be instantiated%s" LOG_SAID, number);
     const size_t said_length = said == NULL ? 0 : strlen(said);
     const size_t room = size - 1 - length;
 

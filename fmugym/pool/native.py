@@ -36,8 +36,9 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import new_arrays
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.play_form import Rows, form_of_play
-from fmugym.pool.reports import Receiver, loading_failed
+from fmugym.pool.reports import FRESH_PROCESSES, REFUSED_ANEW, Receiver, loading_failed
 from fmugym.pool.requests import (
     Answer,
     Answers,
@@ -144,7 +145,8 @@ class NativePool(AskingPool):
         try:
             return _native.Pool(form, arrays, Receiver(log, description), fmu.calls_python())
         except OSError as error:
-            raise FMULoadError(loading_failed(fmu.path.name, str(error), fmu.extract())) from None
+            text = loading_failed(fmu.path.name, str(error), fmu.extract(), FRESH_PROCESSES)
+            raise FMULoadError(text) from None
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""
@@ -214,7 +216,9 @@ class NativePool(AskingPool):
         if not 0 <= index < self.num_instances:
             raise IndexError(f"there is no instance {index}")
         content, tell = Writer().integers(index).form(), self._answers.failure
-        return self._ask_pool(Request.FAILURE, content, lambda reader: tell(reader, index))
+        text = self._ask_pool(Request.FAILURE, content, lambda reader: tell(reader, index))
+        is_full = REFUSED_ANEW in text and not speaks_of_licence(text)
+        return text + FRESH_PROCESSES if is_full else text
 
     def _ask(
         self,

@@ -15,10 +15,13 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import printable
 from fmugym.fmi.status import failed_call
 from fmugym.fmi.words import quoted, unpacked
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.system_description import SystemDescription
 
 __all__ = [
+    "FRESH_PROCESSES",
+    "MORE_PROCESSES",
     "REFUSED_ANEW",
     "Failure",
     "Receiver",
@@ -43,6 +46,18 @@ _ADVICE: Final = (
 
 REFUSED_ANEW: Final = "the FMU refused to be instantiated anew"
 """How a failure of an instance begins that could not be made again; see ``native/instances.c``."""
+
+FRESH_PROCESSES: Final = (
+    '; if it makes only so many instances in one process, isolation="process" goes on in fresh '
+    "worker processes, and a vector environment may have several of them (workers)"
+)
+"""What helps against refusals in the caller's process."""
+
+MORE_PROCESSES: Final = "; if it makes only so many instances in one process, give more workers"
+"""What helps against refusals in a worker process that makes several instances."""
+
+_REFUSED: Final = "it refused to be instantiated"
+"""How an error of the extension begins if an instance cannot be made; see ``native/pools.c``."""
 
 _SAID: Final = "\x1d"
 """Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
@@ -97,11 +112,17 @@ def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
     return printable(", ".join(bad))
 
 
-def loading_failed(fmu: str, error: str, folder: Path) -> str:
-    """Say why an FMU of this name cannot be loaded from a folder, with what it said."""
+def loading_failed(fmu: str, error: str, folder: Path, processes: str) -> str:
+    """Say why an FMU of this name cannot be loaded from a folder, with what it said.
+
+    What helps if there are too many instances in a process is said of one that is not the first,
+    and where the FMU gave no reason.
+    """
     reason, _, said = error.partition(_SAID)
     advice = "" if is_plain(folder) else _ADVICE.format(folder)
-    return f"{fmu} cannot be loaded: {reason}{quoted(unpacked(said))}{advice}"
+    text = f"{fmu} cannot be loaded: {reason}{quoted(unpacked(said))}{advice}"
+    is_full = reason.startswith(_REFUSED) and not (reason == _REFUSED and said)
+    return text + processes if is_full and not speaks_of_licence(text) else text
 
 
 def as_log_record(name: str, status: int, category: str, message: str) -> tuple[int, str]:

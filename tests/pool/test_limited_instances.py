@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from process_tools import posix_only
 
-from fmugym import FMU, FMUSystem
+from fmugym import FMU, FMULoadError, FMUSystem
 from fmugym.pool import PoolSpec
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.opening import make_pool
@@ -83,11 +83,27 @@ def test_a_fresh_worker_goes_on(make, tmp_path, caplog, num_instances):
 
 @posix_only
 def test_a_limit_of_the_process_of_the_caller(make, tmp_path, monkeypatch):
-    """Nothing helps there but workers."""
+    """Nothing helps there but workers, and the message says so."""
     monkeypatch.setenv("MADE_BY_LIMITED", "0")  # which is restored afterwards
     pool = make(limited_fmu(tmp_path, "process"), 1)
-    with pytest.raises(AssertionError, match="refused to be instantiated anew"):
+    words = 'refused to be instantiated anew.*isolation="process".*vector environment.*workers'
+    with pytest.raises(AssertionError, match=words):
         play(pool, 2 * LIMIT)
+    with pytest.raises(FMULoadError, match=r'refused to be instantiated; .*isolation="process"'):
+        make(limited_fmu(tmp_path, "process"), 1)  # the next one in this process
+
+
+@posix_only
+def test_more_instances_than_a_process_can_have(make, tmp_path, monkeypatch):
+    """Each message names what helps there, and it does."""
+    monkeypatch.setenv("MADE_BY_LIMITED", "0")
+    path, number = limited_fmu(tmp_path, "process"), f"number {LIMIT + 1} of {LIMIT + 1}"
+    with pytest.raises(FMULoadError, match=f'{number}.*isolation="process"'):
+        make(path, LIMIT + 1)
+    monkeypatch.setenv("MADE_BY_LIMITED", "0")
+    with pytest.raises(FMULoadError, match=f"{number}.*give more workers"):
+        make(path, LIMIT + 1, isolation="process", workers=1)
+    play(make(path, LIMIT + 1, isolation="process", workers=2), 2)
 
 
 def test_of_a_system(make, tmp_path):

@@ -27,7 +27,7 @@ from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output, describe_exit, lines_of_echo
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Copies, Memory
-from fmugym.pool.reports import Receiver, loading_failed
+from fmugym.pool.reports import MORE_PROCESSES, Receiver, loading_failed
 from fmugym.pool.requests import (
     Answer,
     Answers,
@@ -473,7 +473,7 @@ class Supervisor:
                 self._setup.fmu.require_libraries(self._setup.folder)
         except FMULoadError as error:
             return str(error)
-        return loading_failed(self._name, text, self._setup.folder)
+        return loading_failed(self._name, text, self._setup.folder, MORE_PROCESSES)
 
     def _receive(self, deadline: float, doing: str, read: Callable[[Reader], Any] | None) -> Any:
         while True:
