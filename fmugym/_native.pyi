@@ -83,9 +83,6 @@ def initializations() -> int:
 def undisturbed(function: Callable[..., Any], /, *arguments: Any) -> Any:
     """Call a function; handlers of signals that arrive meanwhile run afterwards."""
 
-def text_with(number: float, /) -> str | None:
-    """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
-
 def serve(channel: int, memory: int, /) -> None:
     """Be a worker until the other end of the channel is closed; see ``native/worker``.
 

@@ -266,8 +266,7 @@ class EnvConfig:
     )
     monitor_names: tuple[str, ...] = key(
         NAMES,
-        "Variables that are read along with the outputs: in `out`, not in `state`. "
-        "[Strings](fmi.md#strings), too.",
+        "Variables that are read along with the outputs: in `out`, not in `state`.",
         (),
     )
     episode_variables: Mapping[str, Any] = key(

@@ -16,7 +16,6 @@ import numpy as np
 from gymnasium import logger as gymnasium_logger
 from gymnasium.envs.registration import EnvSpec
 
-from fmugym.archive.texts import values_by_name
 from fmugym.checks import check_misplaced, check_option, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import (
@@ -433,18 +432,18 @@ class FMUEnv(Constructed):
     def read_variables(self, *names: str) -> dict[str, Any]:
         """Read any variables of the FMU now, for inspection outside of an episode's loop.
 
-        The name of an array stands for its elements, which come by their own names. The values are
-        numbers, those of Strings texts.
+        The name of an array stands for its elements, which come by their own names.
 
         Raises:
-            ConfigError: If a name is unknown or its variable is neither numeric nor a String.
+            ConfigError: If a name is unknown or its variable is not numeric.
             SimulationError: If the environment is closed or was never reset.
         """
         pool = self._open_pool("read_variables")
         if not self.inside.was_reset:
             raise SimulationError("read_variables was called before the first reset")
         variables = readable_named(self.fmu.description, names)
-        return values_by_name(variables, pool.read(variables)[:, 0].tolist())
+        values = pool.read(variables)[:, 0].tolist()
+        return {one.name: value for one, value in zip(variables, values, strict=True)}
 
     @property
     @alone

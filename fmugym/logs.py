@@ -16,7 +16,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,7 +42,6 @@ from fmugym.errors import ConfigError, reading, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray
 from fmugym.recording import Recorder, Recording
-from fmugym.series.store import TEXT
 from fmugym.task.actions import flat_inputs
 
 __all__ = [
@@ -78,7 +77,6 @@ class PlantLog:
         episodes: Numbers of the episodes, shape (n,).
         inputs_before: Whether inputs in a row are those that led to it, from the row before;
             otherwise they hold until the next row.
-        texts: The cells of the columns that are no numbers, by name: remarks, or Strings.
     """
 
     times: FloatArray
@@ -86,7 +84,6 @@ class PlantLog:
     units: Mapping[str, str]
     episodes: FloatArray
     inputs_before: bool = False
-    texts: Mapping[str, npt.NDArray[np.object_]] = field(default_factory=dict)
 
     @classmethod
     def read(
@@ -122,20 +119,15 @@ class PlantLog:
         if time is None or units.pop(time.name, "s") != "s":
             raise ConfigError(f"{shown(str(path))} has no column 'time' of seconds or dates")
         del columns[time.name]
-        texts = {
-            name: np.array([*column.cells], object)
-            for name, column in columns.items()
-            if units.get(name) == TEXT or not column.is_numeric
-        }
-        values = {name: one.numbers for name, one in columns.items() if name not in texts}
+        values = {name: one.numbers for name, one in columns.items() if one.is_numeric}
         times, is_known = _times(time, zone, standard)
         numbers = values.pop("episode", None)
         numbers = _episodes(times, is_known) if numbers is None else numbers[is_known]
         _require_rising(time, np.flatnonzero(is_known), times, numbers)
         before = "step" in values if inputs_before is None else inputs_before
-        values, texts = ({n: one[is_known] for n, one in a.items()} for a in (values, texts))
+        values = {name: one[is_known] for name, one in values.items()}
         units = {name: unit for name, unit in units.items() if name in values}
-        return cls(times, values, units, numbers.astype(np.float64), before, texts)
+        return cls(times, values, units, numbers.astype(np.float64), before)
 
     @property
     def proposed(self) -> PlantLog | None:
@@ -167,7 +159,6 @@ class PlantLog:
                 times=self.times[rows],
                 columns=columns,
                 episodes=self.episodes[rows],
-                texts={name: cells[rows] for name, cells in self.texts.items()},
             )
 
 

@@ -329,24 +329,6 @@ static Type stored_type(const Fmi *fmi, Type type) {
     return type == TYPE_BOOLEAN ? boolean : type;
 }
 
-static Status get_texts(const Access *access, const Group *group, const Library *library,
-                        void *component, double *values, const Floats *floats) {
-    Status worst = STATUS_OK;
-
-    for (size_t i = 0; i < group->listed.count && worst <= STATUS_WARNING; i++) {
-        const char *text = NULL;
-        Status status = access->fmi->get_string(library, component, group->references[i], &text);
-        const double number = status <= STATUS_WARNING ? text_number(text) : 0.0;
-        status = number < 0.0 ? STATUS_ERROR : status;
-        worst = status > worst ? status : worst;
-        floats_restore_if_seen(floats);
-        if (worst <= STATUS_WARNING) {
-            values[group->listed.positions[i]] = number;
-        }
-    }
-    return worst;
-}
-
 Status access_get(const Access *access, const Library *library, void *component, double *values,
                   void *typed, const Floats *floats) {
     const Fmi *fmi = access->fmi;
@@ -361,8 +343,6 @@ Status access_get(const Access *access, const Library *library, void *component,
     }
     for (size_t i = 0; i < access->number_of_groups && worst <= STATUS_WARNING; i++, group++) {
         if (group->type == TYPE_STRING) {
-            const Status got = get_texts(access, group, library, component, values, floats);
-            worst = got > worst ? got : worst;
             continue;
         }
         const Status status = fmi->get(library, component, group->type, group->references,

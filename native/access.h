@@ -4,7 +4,6 @@
 #define FMUGYM_ACCESS_H
 
 #include "fmi.h"
-#include "texts.h"
 
 /* What stands in a list of variables in the place of a type, where the value is no variable's but the
  * start time of the episode. */
@@ -23,6 +22,12 @@ typedef struct {
     uint32_t *positions; /* in the list */
     uint32_t *places;    /* in the FMU's memory */
 } Part;
+
+/* A text that a String may start with, and the number that stands for it. */
+typedef struct {
+    double number;
+    const char *text;
+} Text;
 
 /* The variables of one C type. An array is moved as a whole, so there is one value reference for
  * all of its elements. */
@@ -98,14 +103,13 @@ Status variable_set(const Fmi *fmi, const Library *library, void *component, Typ
 
 /* Both functions use typed as scratch memory for width doubles and return the worst
  * status. They stop after the first type whose status is worse than a warning. They restore the
- * floating-point environment after each call into the FMU. A String is the number of
- * its text, see texts.h; access_set leaves Strings out. */
+ * floating-point environment after each call into the FMU. Both leave Strings out. */
 Status access_get(const Access *access, const Library *library, void *component, double *values,
                   void *typed, const Floats *floats);
 Status access_set(const Access *access, const Library *library, void *component,
                   const double *values, void *typed, const Floats *floats);
 
-/* Sets the Strings. Of one that is refused, sets refused to the value reference. */
+/* Sets the Strings, whose values are the numbers of their texts. Of one that is refused, sets refused to the value reference. */
 Status access_set_texts(const Access *access, const Library *library, void *component,
                         const double *values, const Floats *floats, uint32_t *refused);
 

@@ -24,7 +24,6 @@ const Fmi composite = {
     .get = system_get,
     .set = system_set,
     .set_string = system_set_string,
-    .get_string = system_get_string,
     .reset = system_reset,
     .terminate = system_terminate,
     .free_instance = system_free,

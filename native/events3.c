@@ -38,7 +38,6 @@ static const Fmi fmu = {
     .get = get3,
     .set = set3,
     .set_string = set_string3,
-    .get_string = get_string3,
     .derive = derive,
     SHARED_FUNCTIONS,
     SHARED_STATES,

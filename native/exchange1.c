@@ -49,7 +49,6 @@ static const Binding bindings[] = {
     {"CompletedIntegratorStep", offsetof(Functions, complete), true},
     BINDINGS_OF_VALUES_1,
     {"SetString", offsetof(Functions, older.set_string), false},
-    {"GetString", offsetof(Functions, older.get_string), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -116,7 +115,6 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
-    .get_string = older_get_string,
     SHARED_FUNCTIONS,
 };
 

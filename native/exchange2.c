@@ -61,7 +61,6 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
-    .get_string = older_get_string,
     .derive = derive,
     SHARED_FUNCTIONS,
     SHARED_STATES,

@@ -154,9 +154,6 @@ typedef struct Fmi {
                   size_t count, const void *values, size_t size);
     Status (*set_string)(const Library *library, void *component, uint32_t reference,
                          const char *text);
-    /* The text is the FMU's, until the next call. */
-    Status (*get_string)(const Library *library, void *component, uint32_t reference,
-                         const char **text);
     Status (*reset)(const Library *library, void *component);
     Status (*terminate)(const Library *library, void *component);
     void (*free_instance)(const Library *library, void *component);

@@ -33,7 +33,6 @@ static const Binding bindings[] = {
     {"ResetSlave", offsetof(Functions, older.common.reset), false},
     BINDINGS_OF_VALUES_1,
     {"SetString", offsetof(Functions, older.set_string), false},
-    {"GetString", offsetof(Functions, older.get_string), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -87,6 +86,5 @@ const Fmi fmi1 = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
-    .get_string = older_get_string,
     SHARED_FUNCTIONS,
 };

@@ -69,7 +69,6 @@ typedef struct {
     ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),                                       \
     ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),                                     \
     {"SetString", offsetof(Functions, older.set_string), false},                                   \
-    {"GetString", offsetof(Functions, older.get_string), false},                                   \
     {"GetFMUstate", offsetof(Functions, older.common.get_state), false},                           \
     {"SetFMUstate", offsetof(Functions, older.common.set_state), false},                           \
     {"FreeFMUstate", offsetof(Functions, older.common.free_state), false},                         \

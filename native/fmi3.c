@@ -69,7 +69,6 @@ const Fmi fmi3 = {
     .get = get3,
     .set = set3,
     .set_string = set_string3,
-    .get_string = get_string3,
     .derive = derive,
     SHARED_FUNCTIONS,
     SHARED_STATES,

@@ -37,8 +37,6 @@ typedef struct {
     Set3 *set[NUMBER_OF_TYPES];
     int (*set_string)(void *instance, const uint32_t *references, size_t number_of_references,
                       const char *const *values, size_t number_of_values);
-    int (*get_string)(void *instance, const uint32_t *references, size_t number_of_references,
-                      const char **values, size_t number_of_values);
 
     /* co-simulation */
     void *(*instantiate_steps)(const char *name, const char *token, const char *resources,
@@ -99,7 +97,6 @@ typedef struct {
     VALUES("UInt64", TYPE_UINT64),                                                                 \
     VALUES("Boolean", TYPE_BOOLEAN),                                                               \
     {"SetString", offsetof(Functions, set_string), false},                                         \
-    {"GetString", offsetof(Functions, get_string), false},                                         \
     {"GetFMUState", offsetof(Functions, common.get_state), false},                                 \
     {"SetFMUState", offsetof(Functions, common.set_state), false},                                 \
     {"FreeFMUState", offsetof(Functions, common.free_state), false},                               \
@@ -244,15 +241,6 @@ static inline Status derive(const Library *library, void *instance, const Deriva
                : sane(function(instance, d->unknowns, d->number_of_unknowns, d->knowns,
                                d->number_of_knowns, d->seed, d->size_of_seed, values,
                                d->size_of_values));
-}
-
-static inline Status get_string3(const Library *library, void *instance, uint32_t reference,
-                                 const char **text) {
-    const Functions *f = functions_of(library);
-    if (f->get_string == NULL) {
-        return STATUS_ERROR;
-    }
-    return sane(f->get_string(instance, &reference, 1, text, 1));
 }
 
 #endif

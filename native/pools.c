@@ -13,7 +13,6 @@
 #include "instances.h"
 #include "recorded_inputs.h"
 #include "snapshots.h"
-#include "texts.h"
 #include "threads.h"
 
 static Mutex list_lock = MUTEX_INITIALIZER;
@@ -191,18 +190,15 @@ void pool_dispose(Pool *pool) {
 static void before_fork(void) {
     mutex_lock(&list_lock);
     log_before_fork();
-    texts_before_fork();
 }
 
 static void after_fork_in_parent(void) {
-    texts_after_fork_in_parent();
     log_after_fork_in_parent();
     mutex_unlock(&list_lock);
 }
 
 static void after_fork_in_child(void) {
     log_after_fork_in_child();
-    texts_after_fork_in_child();
     mutex_reset(&list_lock);
     mutex_reset(&shared_making);
     threads_reset();

@@ -5,7 +5,6 @@
 
 #include "derivatives.h"
 #include "states.h"
-#include "texts.h"
 
 typedef struct {
     Pool *pool;
@@ -219,11 +218,6 @@ static Answer answer_count_steps(Asked *a) {
     return answer(a, -1);
 }
 
-static Answer answer_text_of(Asked *a) {
-    write_text(a->writer, text_with(read_number(a->reader)));
-    return answer(a, -1);
-}
-
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer) {
     static Answer (*const answers[REQUESTS])(Asked *) = {
         [REQUEST_WRITE] = answer_write,
@@ -233,7 +227,6 @@ Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, W
         [REQUEST_COUNT_STEPS] = answer_count_steps,
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_DIFFERENTIATE] = answer_differentiate,
-        [REQUEST_TEXT_OF] = answer_text_of,
     };
     Asked asked = {pool, inputs, reader, writer};
 

@@ -29,8 +29,6 @@ typedef struct {
     Set *set[NUMBER_OF_TYPES];
     int (*set_string)(void *component, const uint32_t *references, size_t count,
                       const char *const *values);
-    int (*get_string)(void *component, const uint32_t *references, size_t count,
-                      const char **values);
 } Older;
 
 #define COUNT_OF(array) (sizeof(array) / sizeof *(array))
@@ -136,13 +134,6 @@ static inline Status older_set_string(const Library *library, void *component,
     const Older *f = older_of(library);
     return f->set_string == NULL ? STATUS_ERROR
                                  : sane(f->set_string(component, &reference, 1, &text));
-}
-
-static inline Status older_get_string(const Library *library, void *component,
-                                      uint32_t reference, const char **text) {
-    const Older *f = older_of(library);
-    return f->get_string == NULL ? STATUS_ERROR
-                                 : sane(f->get_string(component, &reference, 1, text));
 }
 
 /* The entries of these functions in a table, and of those for FMU states. */

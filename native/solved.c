@@ -288,12 +288,6 @@ Status solved_derive(const Library *library, void *component, const Derivation *
                                : fmi->derive(library, me->component, derivation, values);
 }
 
-Status solved_get_string(const Library *library, void *component, uint32_t reference,
-                         const char **text) {
-    const Solver *me = component;
-    return fmi_of(me)->get_string(library, me->component, reference, text);
-}
-
 Status solved_reset(const Library *library, void *component) {
     const Solver *me = component;
 

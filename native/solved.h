@@ -24,8 +24,6 @@ Status solved_set(const Library *library, void *component, Type type, const uint
                   size_t count, const void *values, size_t size);
 Status solved_set_string(const Library *library, void *component, uint32_t reference,
                          const char *text);
-Status solved_get_string(const Library *library, void *component, uint32_t reference,
-                         const char **text);
 Status solved_derive(const Library *library, void *component, const Derivation *derivation,
                      double *values);
 Status solved_reset(const Library *library, void *component);
@@ -43,7 +41,7 @@ Status solved_deserialize(const Library *library, void *component, const char *b
 /* The part of the table of an FMI version that is the same for all, and the FMU states. */
 #define SOLVED_FUNCTIONS                                                                           \
     .initialize = solved_initialize, .do_step = solved_do_step, .get = solved_get,                 \
-    .set = solved_set, .set_string = solved_set_string, .get_string = solved_get_string,           \
+    .set = solved_set, .set_string = solved_set_string,                                            \
     .derive = solved_derive, .reset = solved_reset, .terminate = solved_terminate,                 \
     .free_instance = solved_free
 #define SOLVED_STATES                                                                              \

@@ -218,8 +218,6 @@ Status system_set(const Library *library, void *component, Type type, const uint
                   size_t count, const void *values, size_t size);
 Status system_set_string(const Library *library, void *component, uint32_t reference,
                          const char *text);
-Status system_get_string(const Library *library, void *component, uint32_t reference,
-                         const char **text);
 Status system_get_state(const Library *library, void *component, void **state);
 Status system_set_state(const Library *library, void *component, void *state);
 Status system_free_state(const Library *library, void *component, void **state);

@@ -264,20 +264,3 @@ Status system_set_string(const Library *library, void *component, uint32_t refer
     }
     return good ? STATUS_OK : STATUS_ERROR;
 }
-
-Status system_get_string(const Library *library, void *component, uint32_t reference,
-                         const char **text) {
-    Composite *me = component;
-
-    (void)library;
-    me->blamed = NULL;
-    const End *end = first_end(me, reference);
-    if (end == NULL) {
-        return STATUS_ERROR;
-    }
-    const Fmi *fmi = me->system->parts[end->part].fmi;
-    const Status status = fmi->get_string(&me->libraries[end->part], me->components[end->part],
-                                          end->element.reference, text);
-    floats_restore_if_seen(me->floats);
-    return part_judge(me, end->part, status);
-}

@@ -20,7 +20,6 @@ import numpy.typing as npt
 
 from fmugym import _native
 from fmugym.archive.fmu import FMU, copy_libraries, extracted_again
-from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.pool.asking import AskingPool
@@ -55,8 +54,6 @@ _MOST_CACHED: Final = 64
 
 _BETWEEN_LOOKS: Final = 1e-3
 """Seconds between two looks for the FMU's files in steps; a look takes some microseconds."""
-
-ask_for_texts(_native.text_with)
 
 FloatArray32 = npt.NDArray[np.float32]
 

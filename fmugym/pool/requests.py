@@ -56,8 +56,7 @@ class Request(IntEnum):
     FAILURE = 12
     DIFFERENTIATE = 13
     ROLL_OUT = 14
-    TEXT_OF = 15
-    CLOSE = 16
+    CLOSE = 15
 
 
 class Answer(IntEnum):

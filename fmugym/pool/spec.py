@@ -8,7 +8,6 @@ from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.texts import number_of
 from fmugym.archive.variable import Variable
 
 __all__ = [
@@ -168,10 +167,7 @@ class PoolSpec:
     @property
     def start_outputs(self) -> tuple[float, ...]:
         """The start values of the outputs in the model description; 0 where it has none."""
-        return tuple(
-            number_of(variable.start or "") if variable.kind == "string" else variable.start_number
-            for variable in self.outputs
-        )
+        return tuple(variable.start_number for variable in self.outputs)
 
     def fitting(self, description: ModelDescription) -> PoolSpec:
         """The spec for this FMU: one that has no function for resets is instantiated anew.

@@ -10,18 +10,17 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive.texts import number_of, numbers_of
 from fmugym.archive.variable import Variable
 from fmugym.checks import normal_form
 from fmugym.env import FMUEnv
 from fmugym.errors import unknown_name
 from fmugym.pool.base import FloatArray, Pool
-from fmugym.task.quantity import TEXT_KINDS, Quantities, Quantity
+from fmugym.task.quantity import Quantities, Quantity
+from fmugym.task.roles import require_numeric
 
 __all__ = ["Choice", "Episodes", "choose", "matches", "quantities_of"]
 
 _VARYING: Final = ("continuous", "discrete")
-_PARAMETERS: Final = ("parameter", "text parameter")
 
 
 class Episodes(Protocol):
@@ -113,14 +112,16 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
     Raises:
         ConfigError: If a glob matches nothing.
     """
-    quantities, read = _with_texts(env, quantities_of(env))
+    quantities, read = quantities_of(env)
     others = {variable.name: variable for variable in _others(env, quantities)}
     seen = {f"observation.{name}": index for index, name in enumerate(_observation_names(env))}
     if patterns is None:
-        wanted = {one.name for one in quantities if one.kind not in _PARAMETERS}
+        wanted = {one.name for one in quantities if one.kind != "parameter"}
     else:
         named = [one.name for one in quantities] + [n for n in others if _varies(others[n])]
         known = [*named, *seen]
+        for pattern in patterns:
+            _require_numbers(env, pattern)
         wanted = {name for one in patterns for name in _found(one, known, others)}
     places = tuple(i for i, one in enumerate(quantities) if one.name in wanted)
     variables = tuple(others[name] for name in others if name in wanted)
@@ -136,6 +137,13 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
         variables,
         observed,
     )
+
+
+def _require_numbers(env: FMUEnv, name: str) -> None:
+    """Refuse a variable of the FMU that can never be read."""
+    variable = env.fmu.description.variables.get(name)
+    if variable is not None and not variable.is_number and not variable.ticking:
+        require_numeric(variable, "recorded")
 
 
 def _found(pattern: str, known: Sequence[str], others: Iterable[str]) -> list[str]:
@@ -169,8 +177,7 @@ def quantities_of(env: FMUEnv) -> Quantities:
 
 def _of_config(env: FMUEnv) -> Quantities:
     interface, strings = env.inside.interface, env.fmu.description.strings
-    inputs, read_variables = interface.inputs, (*interface.outputs, *interface.monitors)
-    outputs = {p: v for p, v in enumerate(read_variables) if v.name not in strings}
+    inputs, outputs = interface.inputs, (*interface.outputs, *interface.monitors)
     episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
     parameters = tuple(name for name in interface.parameters if name not in strings)
 
@@ -178,13 +185,13 @@ def _of_config(env: FMUEnv) -> Quantities:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *(env.inside.readings.values[index] for index in outputs),
+            *env.inside.readings.values[: len(outputs)],
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )
 
     found = [_of_variable(variable, "action") for variable in inputs]
-    found += [_of_variable(variable) for variable in outputs.values()]
+    found += [_of_variable(variable) for variable in outputs]
     found += [Quantity(name, "memory") for name in episode]
     for name in parameters:
         variable = interface.parameter(name, interface.parameters[name])
@@ -192,45 +199,15 @@ def _of_config(env: FMUEnv) -> Quantities:
     return Quantities(found, read)
 
 
-def _with_texts(env: FMUEnv, quantities: Quantities) -> Quantities:
-    """Add the Strings that the config monitors or sets; they are read as numbers of texts."""
-    strings = env.fmu.description.strings
-    places = {name: place for place, name in enumerate(env.out) if name in strings}
-    given = tuple(name for name in env.inside.interface.parameters if name in strings)
-    if not places and not given:
-        return quantities
-
-    def read(env: Any) -> Sequence[Any]:
-        drawn = env.parameters
-        return (
-            *quantities.read(env),
-            *(env.inside.readings.values[place] for place in places.values()),
-            *(_number(drawn.get(name, np.nan)) for name in given),
-        )
-
-    found = [Quantity(name, TEXT_KINDS[0]) for name in places]
-    found += [Quantity(name, TEXT_KINDS[1]) for name in given]
-    return Quantities([*quantities.all, *found], read)
-
-
-def _number(value: Any) -> Any:
-    """The number of a text, or those of an array of texts."""
-    if isinstance(value, str):
-        return number_of(value)
-    return numbers_of(value) if isinstance(value, np.ndarray) else value
-
-
 def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
-    if variable.kind == "string":
-        return Quantity(variable.name, TEXT_KINDS[0])
     return Quantity(variable.name, kind, variable.unit or "", *variable.range)
 
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
-    """The numbers and Strings of the FMU for which the task has no name of its own."""
+    """The numbers of the FMU for which the task has no name of its own."""
     known = {*env.inside.interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
-        if variable.is_number or (variable.kind == "string" and not variable.shape):
+        if variable.is_number:
             yield from (one for one in variable.elements if one.name not in known)
 
 

@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from io import StringIO
 from itertools import pairwise
-from textwrap import fill
 from typing import Any, Final
 
 import numpy as np
@@ -45,11 +44,6 @@ _UNITS_OF_TIME: Final = (
 )
 _MOST_LINES: Final = 8
 _MOST_POINTS: Final = 4_000
-_LONGEST_TEXT: Final = 24
-_WIDTH_OF_LEGEND: Final = 90
-_WIDTH_OF_KEY: Final = 8
-_WIDTH_OF_LABEL: Final = 12
-"""In letters."""
 
 _PATH: Final = re.compile(r' d="[^"]*"')
 _DIGITS: Final = re.compile(r"(\.\d\d)\d+")
@@ -84,20 +78,16 @@ class _Panel:
         columns: The lines.
         setpoints: Set points of these.
         summed: Whether the lines are sums since the beginning of the episode.
-        is_text: Whether the only column has texts, which are drawn as coloured spans.
     """
 
     label: str
     columns: tuple[Quantity, ...]
     setpoints: tuple[Quantity, ...] = ()
     summed: bool = False
-    is_text: bool = False
 
     @property
     def height(self) -> float:
         """The height compared with that of a panel with one line."""
-        if self.is_text:
-            return 0.6
         return 1.0 if self.summed or len(self.columns) == 1 else 1.4
 
 
@@ -105,9 +95,9 @@ def plot(series: TimeSeries, path: str | os.PathLike[str] | None = None, title: 
     """Draw an episode.
 
     Variables with set points come first, each in a panel of its own; two set points are the edges
-    of a band. All others share a panel with those of the same unit: outputs, data, actions. A
-    String is a row of spans, one colour for each text. Below are the terms of the reward and the
-    costs, summed up over the episode. Dashed red lines are limits.
+    of a band. All others share a panel with those of the same unit: outputs, data, actions. Below
+    are the terms of the reward and the costs, summed up over the episode. Dashed red lines are
+    limits.
 
     Args:
         series: The rows of one episode, see ``TimeSeries.episodes``.
@@ -168,7 +158,7 @@ def _figure(series: TimeSeries, title: str) -> Any:
         axes = figure.subplots(len(panels), sharex=True, squeeze=False, gridspec_kw=ratios)[:, 0]
         times, unit = _times(series)
         for axis, panel in zip(axes, panels, strict=True):
-            (_draw_texts if panel.is_text else _draw)(axis, panel, series, times)
+            _draw(axis, panel, series, times)
         axes[-1].set_xlabel(f"time in {unit}")
         axes[0].set_xlim(times[0], times[-1] if times[-1] > times[0] else times[0] + 1)
         if title:
@@ -197,7 +187,6 @@ def _panels(series: TimeSeries) -> list[_Panel]:
     panels += _by_unit([c for c in seen if c.name not in guided])
     panels += _by_unit([*free, *series.of_kind("data")])
     panels += _by_unit(series.of_kind("action"))
-    panels += [_Panel(one.name, (one,), is_text=True) for one in series.of_kind("text")]
     for label, kinds in _SUMMED.items():
         columns = series.of_kind(*kinds) or series.of_kind(label.removesuffix("s"))
         panels += [_Panel(f"sum of {label}", tuple(columns), summed=True)] if columns else []
@@ -252,40 +241,6 @@ def _draw(axis: Any, panel: _Panel, series: TimeSeries, times: Any) -> None:
 def _draw_legend(axis: Any) -> None:
     place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.0}
     axis.legend(**place, ncols=_MOST_LINES, frameon=False, handlelength=1.6)
-
-
-def _draw_texts(axis: Any, panel: _Panel, series: TimeSeries, times: Any) -> None:
-    """Draw from when to when a String has had each text; the last ones share a colour."""
-    cells = series[panel.columns[0].name]
-    starts = np.flatnonzero(np.r_[True, cells[1:] != cells[:-1]])
-    ends = np.r_[times[starts[1:]], times[-1]]
-    spans: dict[Any, list[tuple[float, float]]] = {}
-    for start, end in zip(starts, ends, strict=True):
-        spans.setdefault(cells[start], []).append((times[start], end - times[start]))
-    named = _fitting(list(spans))
-    for colour, text in zip(COLOURS, named, strict=False):
-        label = _plain(_shortened(text))
-        axis.broken_barh(spans[text], (0, 1), color=colour, alpha=0.6, linewidth=0, label=label)
-    others = [span for text in spans if text not in named for span in spans[text]]
-    if others:
-        label = f"{len(spans) - len(named)} more"
-        axis.broken_barh(others, (0, 1), color=COLOURS[-1], alpha=0.6, linewidth=0, label=label)
-    axis.set(ylim=(0, 1), yticks=[])
-    label = fill(_plain(panel.label), _WIDTH_OF_LABEL)
-    axis.set_ylabel(label, rotation=0, ha="right", va="center")
-    _draw_legend(axis)
-
-
-def _fitting(texts: Sequence[Any]) -> Sequence[Any]:
-    """The first texts, as many as the line above a panel has room for."""
-    ends = np.cumsum([len(_shortened(text)) + _WIDTH_OF_KEY for text in texts])
-    count = min(_MOST_LINES, int(np.searchsorted(ends, _WIDTH_OF_LEGEND, "right")))
-    return texts if count >= len(texts) else texts[: min(count, _MOST_LINES - 1)]
-
-
-def _shortened(text: str | None) -> str:
-    line = " ".join((text or "(empty)").split()) or "(blank)"
-    return line if len(line) <= _LONGEST_TEXT else line[: _LONGEST_TEXT - 1] + "\u2026"
 
 
 def _thinned(times: Any, values: Any) -> tuple[Any, Any]:

@@ -144,8 +144,8 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: An ``FMUEnv``, or wrappers around one.
-        variables: Globs, which choose among the names of the task, all numbers and Strings of the
-            FMU that the task has no name for, and ``observation.NAME``, what the agent sees of a
+        variables: Globs, which choose among the names of the task, all numbers of the FMU
+            that the task has no name for, and ``observation.NAME``, what the agent sees of a
             name; ``*`` is any text, ``?`` one character. By default, all names of the task except
             parameters.
         every: The time from one row to the next in seconds, a multiple of the time step; by default

@@ -8,14 +8,13 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from html import escape
-from itertools import starmap
 from statistics import fmean
 from typing import Final
 
 from fmugym.checks import check_path
 from fmugym.series.intervals import confidence
 from fmugym.series.plots import as_svg
-from fmugym.series.summary import FIGURES, EpisodeSummary, courses, summaries, text_courses
+from fmugym.series.summary import FIGURES, EpisodeSummary, courses, summaries
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 
@@ -243,9 +242,6 @@ def _episodes(series: TimeSeries, prefix: str) -> Iterator[str]:
         opened = "" if len(episodes) > 1 else " open"
         table = _table(header, rows)
         yield f"<details{opened}><summary>Variables in numbers</summary>{table}</details>"
-        if rows := list(starmap(_texts, text_courses(one))):
-            table = _table(["String", "text", "first at", "share"], rows)
-            yield f"<details{opened}><summary>Strings</summary>{table}</details>"
     if len(episodes) > _MOST_PICTURES:
         yield f'<p class="soft">{len(episodes) - _MOST_PICTURES} more episodes are not drawn.</p>'
 
@@ -253,11 +249,6 @@ def _episodes(series: TimeSeries, prefix: str) -> Iterator[str]:
 def _inline(svg: str, prefix: str) -> str:
     """Make the names inside of a picture its own: several are on one page."""
     return _IDS.sub(rf"\g<1>{prefix}-", svg)
-
-
-def _texts(name: str, text: str, begin: float, share: float) -> list[str]:
-    cells = _cell(_duration(begin)), _cell(f"{100 * share:.3g} %")
-    return [_text(name, "first"), _text(text), *cells]
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

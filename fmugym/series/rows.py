@@ -10,11 +10,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import text_of
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.series.choice import Choice, Episodes
 from fmugym.series.timeseries import TimeSeries
-from fmugym.task.quantity import TEXT_KINDS, Quantity
+from fmugym.task.quantity import Quantity
 from fmugym.task.starting import start_time_of
 
 __all__ = ["Infos", "Outcome", "Rows", "batched"]
@@ -138,7 +137,6 @@ class Rows:
         self._starts: Any = np.zeros(count)
         columns, limits = tuple(self._columns()), getattr(episodes.prototype, "cost_limits", {})
         self.none = TimeSeries(columns, np.empty((0, len(columns))), cost_limits=limits)
-        self._texts = [i for i, one in enumerate(columns) if one.kind in TEXT_KINDS]
 
     def _columns(self) -> Iterator[Quantity]:
         if self._episodes.is_vector:
@@ -227,14 +225,7 @@ class Rows:
         told = {
             rows[index]: str(why) for index, why in infos.each("fault").items() if index in rows
         }
-        table = np.array(parts, np.float64).T
-        texts = _texts_in(table[:, self._texts]) if self._texts else {}
-        return replace(self.none, values=table, faults=told, texts=texts)
-
-
-def _texts_in(numbers: FloatArray) -> dict[float, str]:
-    """The texts by their numbers, as long as somebody knows them."""
-    return {number: text_of(number) for number in np.unique(numbers).tolist() if number == number}
+        return replace(self.none, values=np.array(parts, np.float64).T, faults=told)
 
 
 def _summed(infos: Infos) -> Iterator[tuple[str, ...]]:

@@ -13,11 +13,10 @@ from typing import Any, Final, Protocol
 
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
-from fmugym.task.quantity import TEXT_KINDS, Quantity
+from fmugym.task.quantity import Quantity
 
 __all__ = [
     "FAULT",
-    "TEXT",
     "WHOLE",
     "Memory",
     "Store",
@@ -27,9 +26,6 @@ __all__ = [
 
 FAULT: Final = "fault"
 """The last column: the reason of a fault, a text."""
-
-TEXT: Final = "text"
-"""What stands in the place of the unit where cells are texts."""
 
 WHOLE: Final = ("index", "flag")
 """The kinds of columns that hold whole numbers."""
@@ -94,9 +90,7 @@ class Memory:
 
 
 def heading(column: Quantity) -> str:
-    """The name and the unit of a column, such as ``T [degC]``; that of texts is ``[text]``."""
-    if column.kind in TEXT_KINDS:
-        return f"{column.name} [{TEXT}]"
+    """The name and the unit of a column, such as ``T [degC]``."""
     return f"{column.name} [{column.unit}]" if column.unit else column.name
 
 
@@ -142,8 +136,7 @@ class ParquetStore:
 
     def _field(self, column: Quantity) -> Any:
         facts = {"unit": column.unit, "quantity": json.dumps(asdict(column))}
-        kind = "string" if column.kind in TEXT_KINDS else "float64"
-        kind = "int64" if column.kind in WHOLE else kind
+        kind = "int64" if column.kind in WHOLE else "float64"
         return self._arrow.field(column.name, self._arrow.type_for_alias(kind), metadata=facts)
 
     def add(self, rows: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 
-__all__ = ["FIGURES", "EpisodeSummary", "courses", "summaries", "text_courses"]
+__all__ = ["FIGURES", "EpisodeSummary", "courses", "summaries"]
 
 FIGURES: Final = ("reward term", "cost term", "kpi")
 """The kinds of columns that tell a number of each episode: its total, or the last KPI."""
@@ -82,18 +82,3 @@ def courses(series: TimeSeries) -> Iterator[tuple[Quantity, tuple[float | None, 
             own = [series[one.name] for one in setpoints if one.of == column.name]
             deviation = np.nanmean(np.abs(values - own[0])) if len(own) == 1 else None
             yield column, (known.min(), known.mean(), known.max(), known[-1], deviation)
-
-
-def text_courses(series: TimeSeries) -> Iterator[tuple[str, str, float, float]]:
-    """Sum up the texts of Strings in an episode, in the order in which they come.
-
-    Yields:
-        The name of the String; a text; when the String had it first, in seconds since the beginning
-        of the episode; the part of the rows in which it has it.
-    """
-    times = series["time"] - series["time"][0]
-    for column in series.of_kind("text"):
-        cells = series[column.name]
-        for text in dict.fromkeys(cells.tolist()):
-            found = cells == text
-            yield column.name, text or "", times[found.argmax()], found.mean()

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import number_of, numbers_of
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
 from fmugym.series.store import FAULT, WHOLE, open_store
-from fmugym.task.quantity import TEXT_KINDS, Quantity
+from fmugym.task.quantity import Quantity
 
 __all__ = ["TimeSeries"]
 
@@ -31,40 +30,32 @@ class TimeSeries:
             ``"index"`` (environment, episode, step), ``"time"``, ``"observation"``, ``"reward"``,
             ``"reward term"``, ``"cost"``, ``"cost term"``, ``"kpi"`` (of the episode until now) and
             ``"flag"`` (terminated, truncated).
-        values: Shape (rows, columns). In columns of the kinds ``"text"`` and ``"text parameter"``,
-            numbers stand for texts.
+        values: Shape (rows, columns).
         faults: The reasons of faults by row.
         cost_limits: What the costs of an episode may add up to, by name.
-        texts: The texts by the numbers that stand for them.
     """
 
     columns: tuple[Quantity, ...]
     values: FloatArray = field(repr=False)
     faults: Mapping[int, str] = field(default_factory=dict)
     cost_limits: Mapping[str, float] = field(default_factory=dict)
-    texts: Mapping[float, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.values)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
-        """The values of a column, shape (rows,): numbers, or texts as objects."""
+        """The values of a column, shape (rows,)."""
         names = [column.name for column in self.columns]
         if name not in names:
             raise unknown_name("column", name, names)
-        place = names.index(name)
-        is_text = self.columns[place].kind in TEXT_KINDS
-        return self._cells(place) if is_text else self.values[:, place]
+        return self.values[:, names.index(name)]
 
     def cells(self) -> list[npt.NDArray[Any]]:
-        """The values of each column in their own type; a text that is missing is None."""
-        return list(map(self._cells, range(len(self.columns))))
-
-    def _cells(self, place: int) -> npt.NDArray[Any]:
-        kind, values = self.columns[place].kind, self.values[:, place]
-        if kind in TEXT_KINDS:
-            return np.array([self.texts.get(value) for value in values.tolist()], object)
-        return values.astype(np.int64) if kind in WHOLE else values
+        """The values of each column in their own type."""
+        return [
+            values.astype(np.int64) if column.kind in WHOLE else values
+            for column, values in zip(self.columns, self.values.T, strict=True)
+        ]
 
     def of_kind(self, *kinds: str) -> list[Quantity]:
         """The columns of some kinds."""
@@ -93,13 +84,11 @@ class TimeSeries:
         """Put the rows of others, which have the same columns, behind these."""
         parts, begin = [self, *others], 0
         faults: dict[int, str] = {}
-        texts: dict[float, str] = {}
         for part in parts:
-            texts |= part.texts
             faults |= {begin + row: reason for row, reason in part.faults.items()}
             begin += len(part)
         values = np.concatenate([part.values for part in parts])
-        return replace(self, values=values, faults=faults, texts=texts)
+        return replace(self, values=values, faults=faults)
 
     # Files.
 
@@ -134,11 +123,10 @@ class TimeSeries:
             raise
         except Exception as error:  # a damaged file may raise anything
             raise ConfigError(f"{shown(str(file))} is no recording: {error}") from None
-        texts: dict[float, str] = {}
-        values = [_read_column(table.column(column.name), column, texts) for column in columns]
+        stored = [table.column(column.name).to_numpy() for column in columns]
         faults = enumerate(table.column(FAULT).to_pylist())
         told = {row: why for row, why in faults if why is not None}
-        return cls(tuple(columns), np.stack(values, axis=1), told, texts=texts)
+        return cls(tuple(columns), np.stack(stored, axis=1).astype(np.float64), told)
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame; ``frame.attrs["units"]`` has the units by name.
@@ -152,12 +140,3 @@ class TimeSeries:
         frame[FAULT] = [self.faults.get(row, "") for row in range(len(self))]
         frame.attrs["units"] = self.units
         return frame
-
-
-def _read_column(stored: Any, column: Quantity, texts: dict[float, str]) -> FloatArray:
-    """The numbers of a column of Arrow; those of texts are noted with their texts."""
-    if column.kind not in TEXT_KINDS:
-        return np.asarray(stored.to_numpy(), np.float64)
-    cells = stored.to_pylist()
-    texts |= {number_of(cell): cell for cell in cells if cell is not None}
-    return numbers_of(cells)

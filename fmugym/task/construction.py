@@ -36,7 +36,7 @@ from fmugym.task.plain import plain_attributes
 from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
-from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues
+from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Constructed", "draws_of", "draws_of_reset", "prepare_hooks", "require_construction"]
@@ -172,16 +172,14 @@ class Constructed(Pictured):
     def _first_readings(self, names: Sequence[str]) -> Readings:
         values = (nan,) * len(names)
         state = values[: self.inside.output_count]
-        strings = frozenset(v.name for v in self.inside.interface.monitors if v.kind == "string")
         start = {"start_time": self.inside.spec.start_time} if self.config.draws_start_time else {}
 
         def present() -> Any:
             return self.inside.readings.values
 
-        named = NamedTexts if strings else NamedValues
         return Readings(
             values=values,
-            out=named("output", names, present, strings),
+            out=NamedValues("output", names, present),
             state=state,
             previous_state=state,
             inputs=tuple(start for _, start in self.inside.start_inputs),

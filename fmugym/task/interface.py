@@ -236,26 +236,19 @@ def _resolved(
     kind = "input, output or parameter in 'bounds'"
     bounds = _by_scalar(description, config.bounds, allowed, kind)
     samplings = _by_scalar(description, config.samplings, read, "output in 'samplings'")
-    found = {
+    return {
         v.name: replace(v, bounds=bounds.get(v.name), sampling=samplings.get(v.name, "last"))
         for v in (*allowed, *read)
         if v.name in bounds or v.name in samplings
     }
-    for variable in found.values():
-        if variable.kind == "string" and variable.sampling != "last":
-            raise ConfigError(
-                f"config key 'samplings': {variable.name!r} is a String, expected 'last', got "
-                f"{variable.sampling!r}"
-            )
-    return found
 
 
 def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
-    """Find what can be read after every step: scalars, all elements of arrays, and Strings.
+    """Find what can be read after every step: scalars, and all elements of arrays.
 
     Raises:
-        ConfigError: If there is no variable of a name, one is named twice, or its value is neither
-            a number nor a text.
+        ConfigError: If there is no variable of a name, one is named twice, or its value is no
+            number.
     """
     return _found(description, names, check_readable)
 

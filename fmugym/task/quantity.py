@@ -7,16 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-__all__ = ["KINDS", "TEXT_KINDS", "Quantities", "Quantity"]
+__all__ = ["KINDS", "Quantities", "Quantity"]
 
 KINDS: Final = (
     *("action", "input", "output", "parameter", "memory", "data", "setpoint", "expression"),
-    *("text", "text parameter"),
 )
 """What a quantity may be: an action is an input that the agent writes."""
-
-TEXT_KINDS: Final = ("text", "text parameter")
-"""The kinds of Strings; their values are the numbers of ``fmugym.archive.texts``."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,8 @@ __all__ = [
 ]
 
 _CURES: Final = {
-    "String": ". A scalar String can be given a text in 'model_parameters', and hooks can read it "
-    "if it is in 'monitor_names'; to observe one, let the FMU tell the same by a number or an "
-    "Enumeration",
+    "String": ". 'model_parameters' can give a scalar String the text that it starts with; to read "
+    "what a String tells, let the FMU tell the same by a number or an Enumeration",
     "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
     "numbers",
 }
@@ -71,13 +70,13 @@ def check_output(description: ModelDescription, variable: Variable) -> None:
 
 
 def check_readable(description: ModelDescription, variable: Variable) -> None:
-    """Do what ``check_output`` does, but allow scalar Strings, too.
+    """Do what ``check_output`` does for a variable that is read, but not observed.
 
     Raises:
-        ConfigError: If it can be neither observed nor read.
+        ConfigError: If it cannot be read.
     """
-    if not variable.is_text:
-        check_output(description, variable)
+    require_numeric(variable, "read in episodes")
+    _require_known_clock(description, variable, "read in episodes")
 
 
 def _require_known_clock(description: ModelDescription, variable: Variable, role: str) -> None:

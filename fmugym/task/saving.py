@@ -69,8 +69,7 @@ def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
         column: Copies a value, or those of several environments.
     """
     columns: Columns = {name: column(getattr(env.inside.readings, name)) for name in READ}
-    texts = {name: env.out[name] for name in env.out.strings}
-    groups = {"parameters": env.parameters, "variables": env.variables, "texts": texts}
+    groups = {"parameters": env.parameters, "variables": env.variables}
     for kind, values in groups.items():
         columns[kind] = {name: column(value) for name, value in values.items()}
     return columns

@@ -154,7 +154,7 @@ def _unpickled(version: int, *parts: Any) -> Snapshot:
     if hashlib.sha256(content).digest() != digest:
         raise SimulationError("the snapshot is damaged: its pickle has changed")
     scope, columns, bundle = pickle.loads(content)
-    for column in (*columns["texts"].values(), *columns["parameters"].values()):
+    for column in columns["parameters"].values():
         numbers_of(value for value in column if isinstance(value, str))  # are now known here
     return Snapshot(scope, columns, bundle)
 

@@ -16,7 +16,6 @@ from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_nam
 __all__ = [
     "EpisodeVariables",
     "LateDict",
-    "NamedTexts",
     "NamedValues",
     "ParameterValues",
     "ShownParameters",
@@ -47,7 +46,6 @@ class NamedValues(Mapping[str, Any]):
         kind: What the names refer to, for error texts.
         names: The names, in the order of the values.
         get_values: Returns the current values.
-        strings: Those of the names whose values are texts; see ``NamedTexts``.
 
     Raises:
         ConfigError: If ``[]`` gets an unknown name; the text suggests the nearest one.
@@ -58,9 +56,8 @@ class NamedValues(Mapping[str, Any]):
         kind: str,
         names: Sequence[str],
         get_values: Callable[[], Sequence[Any]],
-        strings: frozenset[str] = frozenset(),
     ) -> None:
-        self._kind, self.strings = kind, strings
+        self._kind = kind
         self._index = {name: index for index, name in enumerate(names)}
         self._get_values = get_values
         self._found_arrays: dict[str, list[int]] | None = None
@@ -125,21 +122,6 @@ class NamedValues(Mapping[str, Any]):
         other = copy(self)
         other._get_values = get_values
         return other
-
-
-class NamedTexts(NamedValues):
-    """Outputs of which some are Strings.
-
-    Among the values, these are the numbers of their texts. ``[]`` returns the texts: a text for a
-    number, an array of texts for an array of numbers.
-    """
-
-    def __getitem__(self, name: str) -> Any:
-        value = super().__getitem__(name)
-        return self._shown(name, value) if name in self.strings else value
-
-    def _shown(self, name: str, value: Any) -> Any:
-        return texts_of(value)
 
 
 class ParameterValues(dict[str, Any]):

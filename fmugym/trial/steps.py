@@ -170,7 +170,7 @@ def _read_again(pool: TriedPool, played: list[list[Run]]) -> list[list[Run]]:
     Another instance may have been stepped since an instance gave its last row.
     """
     outputs = pool.spec.outputs
-    rows = [i for i, v in enumerate(outputs) if v.sampling == "last" and v.kind != "string"]
+    rows = [i for i, v in enumerate(outputs) if v.sampling == "last"]
     try:
         values = pool.read(tuple(outputs[row] for row in rows))
     except SimulationError:
@@ -368,8 +368,6 @@ def spec_with_long_calls(spec: PoolSpec, step_seconds: float, call_seconds: floa
         spec,
         time_step=spec.time_step * factor,
         substeps=spec.substeps * factor,
-        outputs=tuple(
-            v if v.kind == "string" else replace(v, sampling="mean") for v in spec.outputs
-        ),
+        outputs=tuple(replace(v, sampling="mean") for v in spec.outputs),
         warm_up_steps=0,
     )

@@ -6,7 +6,6 @@
 #include "handlers.h"
 #include "programs.h"
 
-#include "texts.h"
 #include "threads.h"
 
 static PyObject *tuple_of(const char *const *texts, Py_ssize_t count) {
@@ -50,20 +49,6 @@ static PyObject *initializations(PyObject *module, PyObject *unused) {
     return PyLong_FromUnsignedLongLong(number_of_initializations());
 }
 
-static PyObject *py_text_with(PyObject *module, PyObject *number) {
-    const double wanted = PyFloat_AsDouble(number);
-
-    (void)module;
-    if (wanted == -1.0 && PyErr_Occurred()) {
-        return NULL;
-    }
-    const char *text = text_with(wanted);
-    if (text == NULL) {
-        return Py_NewRef(Py_None);
-    }
-    return PyUnicode_DecodeUTF8(text, (Py_ssize_t)strlen(text), "replace");
-}
-
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
@@ -71,7 +56,6 @@ static PyMethodDef functions[] = {
     {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
-    {"text_with", py_text_with, METH_O, NULL},
     {"undisturbed", py_undisturbed, METH_VARARGS, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},
     {"end_with", py_end_with, METH_O, NULL},

@@ -1,4 +1,4 @@
-"""Strings that episodes begin with: constant, drawn, and given for one episode."""
+"""Strings that episodes begin with: constant, drawn, and given for one episode. None is read."""
 
 import pickle
 from functools import partial
@@ -19,6 +19,7 @@ from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
+from fmugym.series import RecordSeries
 
 WORDS = ("a", "ünter", "longest of all", "")
 CHOICE = Choice(WORDS)
@@ -245,3 +246,59 @@ def test_hooks_that_read_a_string_are_named(feedthrough, caplog):
         envs.close()
     assert "_reward_policy" in caplog.text
     assert "String_parameter" in caplog.text
+
+
+NUMBERS = "number or an Enumeration"
+"""What the author of an FMU can add in the place of a String."""
+
+
+class TestNoStringIsRead:
+    @pytest.mark.parametrize("version", VERSIONS)
+    @pytest.mark.parametrize("key", ["model_output_names", "monitor_names"])
+    def test_by_a_config(self, feedthrough, version, key):
+        with pytest.raises(ConfigError, match=f"'String_told'.*String.*{NUMBERS}"):
+            Reading(feedthrough[version], **{key: ["length", "String_told"]})
+
+    def test_by_read_variables(self, feedthrough):
+        env = Reading(feedthrough[3])
+        env.reset()
+        with pytest.raises(ConfigError, match=f"'String_told'.*String.*{NUMBERS}"):
+            env.read_variables("length", "String_told")
+        env.close()
+
+    @pytest.mark.parametrize("name", ["String_told", "String_parameter"])
+    def test_by_a_recorder(self, feedthrough, name):
+        env = Reading(feedthrough[3])
+        with pytest.raises(ConfigError, match=f"'{name}'.*String.*{NUMBERS}"):
+            RecordSeries(env, ["length", name]).reset()
+        env.close()
+
+    def test_by_recorders_of_all(self, feedthrough):
+        recorded = RecordSeries(Reading(feedthrough[3]), ["*", "String_in*", "length"][::2])
+        recorded.reset()
+        names = {column.name for column in recorded.series.columns}
+        recorded.close()
+        assert "length" in names
+        assert not {"String_told", "String_parameter", "String_in", "String_out"} & names
+
+    def test_by_a_task_file(self, feedthrough, tmp_path):
+        (tmp_path / "task.toml").write_text(
+            f"""
+            fmu = "{feedthrough[3]}"
+            time_step = 0.1
+            [agent]
+            actions = ["idle"]
+            observations = ["length"]
+            [variables]
+            idle = {{ name = "Float64_in", min = -1, max = 1 }}
+            [reward]
+            near = "-length * (String_told == 1)"
+            """
+        )
+        with pytest.raises(ConfigError, match=f"(?s)String_told.*String.*{NUMBERS}"):
+            fmugym.load(tmp_path / "task.toml")
+
+    def test_info_lists_them(self, feedthrough, ran):
+        listed = ran("info", feedthrough[3])
+        for name in ("String_told", "String_parameter"):
+            assert name in listed

@@ -89,7 +89,6 @@ def _beyond_fmpy(fmu: FMU, spec: PoolSpec, wishes: Wishes) -> dict[str, bool]:
         "model exchange": about.interface != "co_simulation",
         "clocks and event mode": about.uses_event_mode,
         "libraries for Windows": fmu.in_wine,
-        "Strings": any(variable.kind == "string" for variable in variables),
         "arrays": bool(about.structure) or any(not v.is_scalar for v in variables),
         "samplings": bool(spec.samplings),
         "fault_retries": bool(spec.fault_retries),

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import number_of
-from fmugym.errors import SimulationError, shown
+from fmugym.errors import SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.spec import PoolSpec
 
@@ -118,7 +117,6 @@ class Rig:
         self._hold: Callable[[], None] | None = getattr(backend, "hold", None)
         self._input_names = [variable.name for variable in spec.inputs]
         self._output_names = [variable.name for variable in spec.outputs]
-        self._texts = [i for i, v in enumerate(spec.outputs) if v.kind == "string"]
         self._is_running = False
 
     @property
@@ -194,25 +192,12 @@ class Rig:
             if missing:
                 raise SimulationError(f"the outputs lack {', '.join(map(repr, missing))}")
             outputs = [outputs[name] for name in names]
-        if self._texts and len(outputs) == len(names):
-            outputs = self._without_texts(outputs)
         values: list[float] = np.ravel(np.asarray(outputs, np.float64)).tolist()
         if len(values) != len(names):
             raise SimulationError(
                 f"there are {len(values)} outputs, expected {len(names)} ({', '.join(names)})"
             )
         return values
-
-    def _without_texts(self, outputs: Sequence[Any]) -> list[Any]:
-        """Put numbers in the place of the texts of Strings."""
-        found = list(outputs)
-        for place in self._texts:
-            text = found[place]
-            if not isinstance(text, str):
-                name = self._output_names[place]
-                raise SimulationError(f"the output {name!r} is a String, got {shown(text)}")
-            found[place] = number_of(text)
-        return found
 
 
 def _pair(result: Any) -> tuple[Any, int]:

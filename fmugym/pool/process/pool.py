@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.fmu import FMU, extracted_again
-from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
@@ -116,8 +115,6 @@ class ProcessPool(AskingPool):
             fmu.close()
             raise
         self._prepare_saving(fmu.description, spec)
-        self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
-        ask_for_texts(self._find_text, self)
         single = self.workers == 1
         arrays = memories[0].arrays if single else new_arrays(spec, num_instances)
         self._use(arrays)
@@ -384,20 +381,6 @@ class ProcessPool(AskingPool):
         if self._spec.fault_retries:
             self._take_counts()
         return super().info()
-
-    def _find_text(self, number: float) -> str | None:
-        """Ask the workers for a text that an FMU of theirs has given."""
-        with self._lock:
-            if self._group.refusal or not self._gives_texts:
-                return None
-            content = Writer().numbers(number).form()
-            answers = self._answers(self._group.able, Request.TEXT_OF, content, Reader.text)
-            return next(filter(None, answers), None)
-
-    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
-        """See ``Pool.read``."""
-        self._gives_texts |= any(variable.kind == "string" for variable in variables)
-        return super().read(variables)
 
     def _ask(
         self,

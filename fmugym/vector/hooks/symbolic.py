@@ -11,7 +11,7 @@ import numpy as np
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
-from fmugym.task.values import NamedTexts, ParameterValues
+from fmugym.task.values import NamedValues, ParameterValues
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import LANES, lift, loaded, loaded_rows
@@ -34,9 +34,7 @@ def symbolic_readings(
     rows: Callable[..., Any] = partial(loaded_rows, graph)
     values, strings = rows((len(env.out),), "output"), env.fmu.description.strings
     read = batched(env, LANES, values, rows((len(env.inside.interface.inputs),), "input"))
-    read.out = _SymbolicOutputs(
-        "output", list(env.out), lambda: values, strings.intersection(env.out)
-    )
+    read.out = NamedValues("output", list(env.out), lambda: values)
     kept = rows((len(env.out),), "kept") if judging else values
     read.previous_state = kept[: env.inside.output_count]
     space: Any = env.action_space
@@ -55,13 +53,6 @@ def symbolic_readings(
         head = "before" if judging else "variable", name
         read.variables[name] = rows(shape, *head, dtype=dtype)
     return read
-
-
-class _SymbolicOutputs(NamedTexts):
-    """The symbols of outputs; hooks that read a String cannot be traced."""
-
-    def _shown(self, name: str, value: Any) -> Any:
-        raise UntraceableError(f"it reads the String {name!r}")
 
 
 class _SymbolicParameters(ParameterValues):
