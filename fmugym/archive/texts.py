@@ -1,15 +1,14 @@
-"""Numbers in the place of texts.
+"""Numbers in the place of the texts that Strings start with.
 
-Between the hooks and an FMU all values are float64. A String has a number that stands for its text:
-a hash, which is the same in all processes. A variable holds the texts that it may get as items, as
-an Enumeration does, so that each process which knows the variable can find them by their numbers.
+Between the draws and an FMU all start values are float64. A String has a number that stands for
+its text: a hash, which is the same in all processes. A variable holds the texts that it may get as
+items, as an Enumeration does, so that each process which knows it finds them by their numbers.
 """
 
 from __future__ import annotations
 
 import functools
-import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -20,7 +19,6 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, shown
 
 __all__ = [
-    "ask_for_texts",
     "number_of",
     "numbers_of",
     "text_of",
@@ -39,8 +37,6 @@ _PRIME: Final = 0x100000001B3
 _numbers: Final[dict[str, float]] = {}
 _texts: Final[dict[float, str]] = {}
 """The texts that this process has met, and their numbers."""
-
-_finders: Final[dict[Callable[[float], str | None], None]] = {}
 
 
 def number_of(text: str) -> float:
@@ -71,34 +67,8 @@ def _hash(data: bytes) -> int:
 
 
 def text_of(number: float) -> str:
-    """The text that a number stands for; "" if nobody knows it any more."""
-    known = _texts.get(number)
-    if known is not None:
-        return known
-    found = next(filter(None, (find(number) for find in list(_finders))), None)
-    if found is not None:
-        _texts[number] = found
-    return found or ""
-
-
-def ask_for_texts(find: Callable[[float], str | None], owner: object | None = None) -> None:
-    """Let ``text_of`` ask for texts that FMUs have given elsewhere.
-
-    Args:
-        find: Returns a text, or None. A method of the owner if there is one.
-        owner: When it is gone, it is not asked any more.
-    """
-    if owner is None:
-        _finders[find] = None
-        return
-    method = weakref.WeakMethod(find)
-
-    def find_if_alive(number: float) -> str | None:
-        alive = method()
-        return None if alive is None else alive(number)
-
-    _finders[find_if_alive] = None
-    weakref.finalize(owner, _finders.pop, find_if_alive, None)
+    """The text that a number stands for; "" if this process has not met it."""
+    return _texts.get(number, "")
 
 
 def values_by_name(
@@ -135,6 +105,3 @@ def with_texts(variable: Variable, texts: Sequence[str]) -> Variable:
 @functools.lru_cache(4096)
 def _with_texts(variable: Variable, texts: tuple[str, ...]) -> Variable:
     return replace(variable, items=tuple((text, int(number_of(text))) for text in texts))
-
-
-number_of("")  # nobody has to be asked for the text of an empty String
