@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_integer
+from fmugym.checks import Spellings, check_integer
 from fmugym.declared.dates import Dates, FloatArray, IntArray, shown_date, zone_of
 from fmugym.errors import ConfigError, first_of, shown, unknown_name
 
@@ -209,11 +209,12 @@ class Table:
         """Find a column by its name, or by its number from 1 on.
 
         Raises:
-            ConfigError: If there is none, or there are several of the name.
+            ConfigError: If there is none, or there may be several of the name.
         """
         if not isinstance(key, str):
             return self.columns[check_integer("column", key, 1, len(self.columns)) - 1]
-        numbers = [i for i, name in enumerate(self.names, 1) if name == key]
+        own = Spellings("column", self.names).find(key)
+        numbers = [i for i, name in enumerate(self.names, 1) if name == own]
         if len(numbers) > 1:
             places = ", ".join(map(str, numbers))
             raise ConfigError(

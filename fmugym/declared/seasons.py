@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
+from fmugym.checks import Spellings
 from fmugym.declared.entries import Entry
 from fmugym.distributions import Choice
 from fmugym.errors import unknown_name
@@ -93,10 +94,15 @@ def _excluded(entry: Entry, scenarios: Mapping[str, Scenario]) -> list[Scenario]
     names = entry.value["exclude"]
     if list(names) == ["scenarios"]:
         return list(scenarios.values())
+    spellings, found = Spellings("scenario", scenarios), []
     for name in names:
-        if name not in scenarios and not entry.mistakes.explain(("scenarios", name)):
+        with entry.child("exclude").placing():
+            own = spellings.find(name)
+        if own is not None:
+            found.append(scenarios[own])
+        elif not entry.mistakes.explain(("scenarios", name)):
             raise entry.child("exclude").error(unknown_name("scenario", name, scenarios))
-    return [scenarios[name] for name in names if name in scenarios]
+    return found
 
 
 def held_out_times(root: Entry) -> list[Scenario]:

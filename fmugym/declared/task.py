@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_mapping, check_path, require_regular
+from fmugym.checks import Spellings, check_mapping, check_path, require_regular
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.seasons import read_scenarios
@@ -202,10 +202,12 @@ class Task:
         root = self.begun()
         section = root.child("scenarios")
         scenarios = read_scenarios(section)
-        if name not in scenarios:
+        with section.placing():
+            found = Spellings("scenario", scenarios).find(name)
+        if found is None:
             root.mistakes.require_none()
             raise section.error(unknown_name("scenario", name, scenarios))
-        scenario = scenarios[name]
+        scenario = scenarios[found]
         times = {"clock": scenario.start, "episode_length": scenario.length}
         if "start_time" in self.document and "clock" not in self.document:
             times["start_time"] = scenario.start_after(

@@ -172,6 +172,35 @@ def test_what_may_be_either_is_refused(tmp_path):
         fmugym.load(config)
 
 
+@pytest.mark.parametrize(("declared", "used"), [(MICRO, GREEK), (GREEK, MICRO)])
+def test_scenarios(declared, used):
+    changes = {"episode_length": "10s", "scenarios": {declared: {"start": "10d", "length": "2d"}}}
+    config = task(fmugym.bundled_fmu("Pendulum"), "q", **changes)
+    with closing(fmugym.load({**config, "clock": "5d"}, scenario=used)) as env:
+        assert env.config.episode_variables["clock"] == 10 * 86400
+    season = {"from": "01-09", "to": "01-14", "step": "1d", "exclude": [used]}
+    with closing(fmugym.load({**config, "clock": season})) as env:
+        drawn = {env.reset(seed=seed)[1]["drawn"]["clock"] / 86400 for seed in range(20)}
+        assert drawn == {8.0, 9.0, 12.0, 13.0}
+
+
+def test_columns(tmp_path):
+    file = tmp_path / "data.csv"
+    file.write_text(f"time,{MICRO}\n0,1\n1,2\n", encoding="utf-8")
+    config = task(
+        fmugym.bundled_fmu("Pendulum"),
+        "q",
+        clock="0s",
+        data={"d": {"file": str(file), "time": "time", "column": GREEK}},
+        reward="d",
+    )
+    assert angle_and_reward(config)[1] == pytest.approx(1, abs=0.1)
+    file.write_text(f"time,{MICRO}K,{GREEK}K\n0,1,2\n1,2,3\n", encoding="utf-8")
+    config["data"]["d"]["column"] = f"{MICRO}\u212a"
+    with pytest.raises(TaskError, match=r"data.d.column: .*look the same"):
+        fmugym.load(config)
+
+
 @pytest.mark.parametrize("other", [MICRO, GREEK])
 def test_a_name_is_given_once(other):
     config = task(fmugym.bundled_fmu("Pendulum"), "q", memory={MICRO: 1})
