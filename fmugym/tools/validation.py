@@ -566,8 +566,9 @@ def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
     given = task.root.child("controllers").items() if isinstance(task, Task) else {}
     if not isinstance(task, Task) or not given:
         return
-    is_wrong = False
-    with closing(load(task.physical())) as physical:
+    is_wrong, given_to_env = False, {} if env.spec is None else env.spec.kwargs
+    master = {name: one for name, one in given_to_env.items() if name == "master"}
+    with closing(load(task.physical(), **master)) as physical:
         for name in given.keys() - _acting_in_warm_up(task):
             try:
                 with given[name].placing():

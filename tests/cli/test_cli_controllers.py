@@ -8,6 +8,7 @@ import pytest
 import fmugym
 from fmugym.baselines import controller_of
 from fmugym.episodes.simulation import policy_of, simulate
+from fmugym.tools import validation
 from fmugym.tools.validation import validate
 
 TEXT = """
@@ -152,3 +153,31 @@ def test_a_reward_that_is_no_number_is_told_by_the_exit_status(tmp_path, cli):
     assert "the reward" in out
     code, out, _ = cli("simulate", file, "--action", "0", "--steps", 2)
     assert code == 0
+
+
+SYSTEM = """
+time_step = "0.1s"
+episode_length = "1s"
+reward = "-abs(q)"
+variables.tau = { name = "swing.tau", min = -1, max = 1 }
+variables.q = { name = "swing.q", min = -9, max = 9 }
+controllers.one = "pid of=q setpoint=0 kp=0.1"
+agent = { actions = ["tau"], observations = ["q"] }
+"""
+
+
+@pytest.mark.parametrize("master", [None, "jacobi"])
+def test_a_system_is_stepped_by_the_master_of_the_command_line(tmp_path, cli, monkeypatch, master):
+    """Also where the controllers are checked."""
+    fmu, file, masters = fmugym.bundled_fmu("Pendulum"), tmp_path / "task.toml", []
+    file.write_text(f"system.components.swing = {str(fmu)!r}\n{SYSTEM}")
+
+    def loaded(*arguments, **options):
+        env = fmugym.load(*arguments, **options)
+        masters.append(env.fmu.plan.master)
+        return env
+
+    monkeypatch.setattr(validation, "load", loaded)
+    code, out, _ = cli("validate", file, *(("--master", master) if master else ()))
+    assert code == 0, out
+    assert masters == [master or "gauss_seidel"]
