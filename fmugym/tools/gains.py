@@ -24,7 +24,7 @@ from fmugym.tools.options import (
     tell,
     write_extension,
 )
-from fmugym.tools.targets import maker_of
+from fmugym.tools.targets import player_maker
 from fmugym.tools.watching import watched
 
 __all__ = ["add_tune"]
@@ -69,7 +69,7 @@ def _tune(arguments: argparse.Namespace) -> None:
 def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
     """Search, and keep the best of each round."""
     make_env = partial(
-        maker_of(arguments.task, arguments.scenario, arguments.master), physical=True
+        player_maker(arguments.task, arguments.scenario, arguments.master), physical=True
     )
     with watched(arguments.rounds, "tune") as advance:
 

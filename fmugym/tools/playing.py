@@ -41,7 +41,7 @@ from fmugym.tools.options import (
 from fmugym.tools.plants import add_of_plants, follow_plant, task_of
 from fmugym.tools.shadows import evaluate_log
 from fmugym.tools.speed import Report, bench, speed_table
-from fmugym.tools.targets import maker_of, scenarios_of
+from fmugym.tools.targets import maker_of, player_maker, scenarios_of
 from fmugym.tools.watching import watched
 
 __all__ = ["add_bench", "add_evaluate", "add_simulate"]
@@ -111,7 +111,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
-    return maker_of(arguments.task, arguments.scenario, arguments.master)
+    return player_maker(arguments.task, arguments.scenario, arguments.master)
 
 
 def _play(
@@ -194,7 +194,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
             total = len(scenarios) * len(players) * arguments.episodes
             with watched(total, "evaluate") as advance:
                 for scenario in scenarios:
-                    make_env = maker_of(arguments.task, scenario, arguments.master)
+                    make_env = player_maker(arguments.task, scenario, arguments.master)
                     more = scenario, advance
                     played = evaluate(
                         make_env, players, seeds, arguments.steps, *more, leave_out=leave_out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,13 @@ from typing import Any, Final
 import gymnasium
 
 from fmugym.declared import Task, load
+from fmugym.declared.likely_units import require_units
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.proposal import Proposal
 from fmugym.tools.system_overview import open_model
 
-__all__ = ["maker_of", "scenarios_of"]
+__all__ = ["maker_of", "player_maker", "scenarios_of"]
 
 _MODELS: Final = {".fmu", ".ssp"}
 
@@ -70,6 +71,25 @@ def maker_of(
     if scenario is not None:
         own["scenario"] = scenario
     return partial(_registered, target, own)
+
+
+def player_maker(
+    target: str, scenario: str | None = None, master: str | None = None
+) -> Callable[..., FMUEnv]:
+    """Find what a text names, for commands that play episodes; see ``maker_of``.
+
+    The function refuses a task whose outputs contradict their limits; see ``require_units``.
+    """
+    make = maker_of(target, scenario, master)
+
+    def made(**arguments: Any) -> FMUEnv:
+        with ExitStack() as stack:
+            env = stack.enter_context(closing(make(**arguments)))
+            require_units(env)
+            stack.pop_all()
+        return env
+
+    return made
 
 
 def _nearest(target: str) -> str:

@@ -7,8 +7,6 @@ import json
 import logging
 import math
 import re
-import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 
@@ -466,7 +464,17 @@ class TestNew:
         assert "fmu_unit" not in Proposal(fmugym.FMU(fmugym.bundled_fmu("House"))).text()
 
 
-def test_the_command_line_refuses(tmp_path):
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("validate",),
+        ("simulate", "--steps", "3", "--action", "0.5"),
+        ("evaluate", "--episodes", "1", "--steps", "3", "--action", "0.5"),
+        ("tune", "pid of=T setpoint=21 kp=0.01..1", "--rounds", "1", "--steps", "3"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_the_command_line_refuses(tmp_path, cli, command):
     path = without_units(tmp_path)
     (tmp_path / "task.toml").write_text(
         f"""fmu = {json.dumps(str(path))}
@@ -478,7 +486,7 @@ variables.u = {{ min = 0, max = 1 }}
 agent = {{ actions = ["u"], observations = ["T"] }}
 """
     )
-    command = [sys.executable, "-m", "fmugym", "validate", str(tmp_path / "task.toml")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 1
-    assert 'fmu_unit = "K"' in done.stdout
+    name, *options = command
+    code, out, err = cli(name, tmp_path / "task.toml", *options)
+    assert code == 1
+    assert 'fmu_unit = "K"' in out + err
