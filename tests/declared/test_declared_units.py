@@ -16,7 +16,7 @@ import values_tools
 from fmu_tools import edited_fmu, read_fmu, write_fmu
 
 import fmugym
-from fmugym.declared.likely_units import likely_unit, unit_within
+from fmugym.declared.likely_units import likely_unit, require_units, unit_within
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.fit import fit_logs
 from fmugym.logs import PlantLog
@@ -253,7 +253,30 @@ class TestRefusals:
             house(without_units(tmp_path), config={"units": {"T_op": "K"}})
 
 
+def env_value(task):
+    with fmugym.load(task) as env:
+        return env.reset(seed=0)[0][0]
+
+
 class TestSystems:
+    def test_variables_of_components_have_units(self, tmp_path):
+        components = {"a": str(without_units(tmp_path))}
+        temperature = {"name": "a.T_op", "unit": "degC", "min": 10, "max": 40}
+        task = {
+            "system": {"components": components},
+            "time_step": "15min",
+            "variables": {"u": {"name": "a.u", "min": 0, "max": 1}, "T": temperature},
+            "agent": {"actions": ["u"], "observations": ["T"]},
+            "reward": "1",
+        }
+        with fmugym.load(task) as env, pytest.raises(fmugym.ConfigError, match='fmu_unit = "K"'):
+            require_units(env)
+        kelvin = env_value(task)
+        task["variables"]["T"] = {**temperature, "fmu_unit": "K"}
+        assert env_value(task) == pytest.approx(kelvin - 273.15, abs=1e-3)
+        with fmugym.load(task) as env:
+            require_units(env)
+
     def test_differences_are_linked_without_an_offset(self, tmp_path):
         """A difference in K drives one in degC."""
         paths = []
