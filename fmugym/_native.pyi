@@ -5,13 +5,11 @@ int8 for statuses. Those that are only read may have any strides.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final, ParamSpec, TypeVar, final
+from typing import Any, Final, final
 
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
-P = ParamSpec("P")
-R = TypeVar("R")
 
 MOST_REGISTERS: Final[int]
 """The most registers of a program."""
@@ -58,16 +56,6 @@ def seed(states: Array, indices: Array, words: bytes, /) -> None:
         indices: Which of them, int64, shape (M,).
         words: The seeds, the same number of 32-bit words for each, the lowest first.
     """
-
-@final
-class Guard:
-    """See ``fmugym.task.alone.Guard``."""
-
-    def run(self, name: str, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call a function."""
-
-    def __enter__(self) -> None: ...
-    def __exit__(self, *reason: object) -> None: ...
 
 def statistics() -> dict[str, int]:
     """What helper threads have done in this process.
@@ -263,7 +251,6 @@ class Pool:
 
     def step_one(
         self,
-        guard: Guard,
         judge: Callable[[], Any],
         complete: Callable[[Any], Any] | None,
         watched: tuple[Any, ...],
@@ -274,7 +261,6 @@ class Pool:
         """Do a whole step of a single environment, by a pool of one.
 
         Args:
-            guard: That of the environment, which is taken meanwhile.
             judge: Returns the result if the instance has stepped, but its status or a number is not
                 good.
             complete: Makes the result of a good step whole; None if it is that already.

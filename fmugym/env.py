@@ -28,7 +28,6 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
-from fmugym.task.alone import alone
 from fmugym.task.beginning import FIRST, BeginningOfOne
 from fmugym.task.construction import Constructed, draws_of_reset, prepare_hooks
 from fmugym.task.interface import readable_named
@@ -72,8 +71,8 @@ class FMUEnv(Constructed):
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.
 
-    One thread at a time may use an environment. A method that another thread calls meanwhile raises
-    a ``SimulationError``; only ``close`` waits.
+    An environment is for one thread. Where several use one, their calls may fail and their episodes
+    may be mixed up; the next reset by one thread alone begins a sound episode.
 
     An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
     already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
@@ -167,7 +166,6 @@ class FMUEnv(Constructed):
             f"{first_of(outputs)} every {self.inside.spec.time_step:g} s>"
         )
 
-    @alone
     def reset(
         self,
         *misplaced: object,
@@ -207,7 +205,7 @@ class FMUEnv(Constructed):
         inside.ended = True  # there is no episode if the FMU fails
         try:
             BeginningOfOne(self, draws, episode).begin()
-            inside.was_reset, inside.ended = True, False
+            inside.was_reset, inside.ended, inside.in_hooks = True, False, False
             observation, info = first_observation(self)
             if not inside.has_chosen:
                 self._choose_player(pool)
@@ -265,7 +263,7 @@ class FMUEnv(Constructed):
             result: Result | None = player.step(action, self)
             if result is not None:
                 return result
-        return self.inside.guard.run("step", FMUEnv._step, self, action)
+        return FMUEnv._step(self, action)
 
     def _step(self, action: Any) -> Result:
         """Let the pool do the whole step where it can, and note what a picture shows."""
@@ -332,7 +330,6 @@ class FMUEnv(Constructed):
 
     # Snapshots.
 
-    @alone
     def save_state(self) -> Snapshot:
         """Save the episode at this moment.
 
@@ -355,7 +352,6 @@ class FMUEnv(Constructed):
         bundle = pool.save_instances(FIRST)
         return Snapshot(scope_of(self), columns_of(self), bundle)
 
-    @alone
     def restore_state(self, snapshot: Snapshot) -> Any:
         """Go on from a snapshot, with its random generator, too; no reset is needed before.
 
@@ -395,7 +391,6 @@ class FMUEnv(Constructed):
         return twin
 
     @property
-    @alone
     def health(self) -> dict[str, int]:
         """Counts of what happened since the environment was made, by name.
 
@@ -425,10 +420,8 @@ class FMUEnv(Constructed):
         """
         if not self.inside.own.goal_reward:
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
-        run = self.inside.guard.run
-        return lambda one, other, _: run("compute_reward", self._goal_reward, one, other)
+        return lambda one, other, _: self._goal_reward(one, other)
 
-    @alone
     def read_variables(self, *names: str) -> dict[str, Any]:
         """Read any variables of the FMU now, for inspection outside of an episode's loop.
 
@@ -446,7 +439,6 @@ class FMUEnv(Constructed):
         return {one.name: value for one, value in zip(variables, values, strict=True)}
 
     @property
-    @alone
     def np_random(self) -> np.random.Generator:
         """The environment's generator; hooks must not use it."""
         if self.inside.in_hooks:
@@ -457,28 +449,22 @@ class FMUEnv(Constructed):
         return super().np_random
 
     @np_random.setter
-    @alone
     def np_random(self, value: np.random.Generator) -> None:
         self._np_random = value
         self._np_random_seed = -1
 
     @property
-    @alone
     def np_random_seed(self) -> int:
         """The seed of the generator; -1 if it was given as a whole."""
         return super().np_random_seed
 
     def close(self) -> None:
-        """Free the FMU and its temporary folder; more than one call is fine.
-
-        If another thread is in a method of the environment, this waits for it.
-        """
-        with self.inside.guard:
-            self._is_closed = True
-            self.inside.close_pool()
-            if self.inside.renderer is not None:
-                self.inside.renderer.close()
-                self.inside.renderer = None
+        """Free the FMU and its temporary folder; more than one call is fine."""
+        self.inside.is_closed = True
+        self.inside.close_pool()
+        if self.inside.renderer is not None:
+            self.inside.renderer.close()
+            self.inside.renderer = None
         super().close()
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:

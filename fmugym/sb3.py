@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from itertools import repeat
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,6 @@ except ImportError as error:
 
 __all__ = ["FMUVecEnv", "ScaledActions", "make_sb3_env"]
 
-R = TypeVar("R")
 
 Indices = int | Iterable[int] | None
 StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
@@ -197,7 +196,8 @@ class FMUVecEnv(VecEnv):
             ConfigError: If there is none of this name (it is an ``AttributeError``, too).
         """
         read = self.vector_env.inside.attributes.read
-        return self._alone("get_attr", read, attr_name, self._numbers(indices))
+        require_open(self.vector_env, "get_attr")
+        return read(attr_name, self._numbers(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute, or a parameter of the FMU from the next episode on.
@@ -214,7 +214,8 @@ class FMUVecEnv(VecEnv):
         attributes = self.vector_env.inside.attributes
         given = dict.fromkeys(self._numbers(indices), value)
         if not attributes.is_parameter(attr_name):
-            self._alone("set_attr", attributes.set_attribute, attr_name, given)
+            require_open(self.vector_env, "set_attr")
+            attributes.set_attribute(attr_name, given)
             return
         complete = self._all_values(attr_name, given)
         self.vector_env.set_attr(attr_name, complete)
@@ -248,12 +249,8 @@ class FMUVecEnv(VecEnv):
         """
         numbers = self._numbers(indices)
         call = self.vector_env.inside.attributes.call
-        return self._alone("env_method", call, method_name, numbers, method_args, method_kwargs)
-
-    def _alone(self, name: str, function: Callable[..., R], *args: Any) -> R:
-        """Call a function of the vector environment, which other threads may not use meanwhile."""
-        require_open(self.vector_env, name)
-        return self.vector_env.inside.guard.run(name, function, *args)
+        require_open(self.vector_env, "env_method")
+        return call(method_name, numbers, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
         """Return False for each: single environments have no wrappers."""

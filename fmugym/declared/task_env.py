@@ -12,7 +12,6 @@ from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
-from fmugym.task.alone import alone
 
 __all__ = ["TaskEnv"]
 
@@ -104,7 +103,6 @@ class TaskEnv(FMUEnv):
             return None
         return self._observation_names
 
-    @alone
     def action_masks(self) -> Any:
         """Tell which levels of the actions take effect now, as MaskablePPO of sb3-contrib asks.
 

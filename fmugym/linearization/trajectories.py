@@ -126,13 +126,6 @@ def linearize_along(
             do not determine what follows.
     """
     require_vector(envs, "linearize_along")
-    run = envs.inside.guard.run
-    return run("linearize_along", _linearize, envs, snapshot, actions, states, method, step)
-
-
-def _linearize(
-    envs: FMUVectorEnv, snapshot: Any, actions: Any, states: Any, method: Any, step: Any
-) -> LinearTrajectory:
     env = envs.inside.prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)

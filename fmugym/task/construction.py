@@ -25,7 +25,6 @@ from fmugym.pool import Pool, PoolSpec
 from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
-from fmugym.task.alone import alone
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.hooks import Hooks, misspelt_hooks
 from fmugym.task.input_writer import InputWriter
@@ -58,8 +57,6 @@ class Constructed(Pictured):
 
     _warm_up: WarmUp | None = None
     """What happens in warm-ups with moving inputs; the pool knows of others only."""
-
-    _is_closed = False
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keep the arguments, because an environment pickles as its class and arguments."""
@@ -116,7 +113,7 @@ class Constructed(Pictured):
         """The pool, which is opened now if that has been deferred."""
         if not self.inside.is_open:
             require_construction(self)
-            if self._is_closed:
+            if self.inside.is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
             self.inside.opening = self.inside.opening.apart()
             self.fmu = self.inside.opening.fmu
@@ -124,7 +121,6 @@ class Constructed(Pictured):
         return self.inside.pool
 
     @property
-    @alone
     def reset_method(self) -> str:
         """How episodes begin; see ``EnvConfig``."""
         return str(self._open_pool("reset_method").reset_method)

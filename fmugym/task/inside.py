@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +13,6 @@ import numpy.typing as npt
 
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.base import FloatArray
-from fmugym.task.alone import Guard, make_guard
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.future import Future
 from fmugym.task.input_writer import InputWriter
@@ -67,7 +68,6 @@ class Inside:
     An environment in a batch has the fields of its class, and those of the batch where hooks read.
 
     Attributes:
-        guard: Lets one thread at a time call its methods.
         number: Tells which environments are newer.
         base: ``FMUEnv``, with whose methods those of an environment are compared.
         way: The way of calling hooks, see ``FMUEnv``.
@@ -92,7 +92,10 @@ class Inside:
         held: Returns the outputs that a plant has not told now, whose last values go on.
         own: The hooks that the class has itself.
         readings: What hooks read now.
+        standing_in: Held while other values stand in for those that hooks read: threads that do so
+            at once would put back each other's.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
+        is_closed: Whether the environment is.
         was_reset, ended: Whether there was an episode, and whether there is none that goes on.
         output_count: The number of outputs, without monitored variables.
         no_monitors: Whether there are none of these.
@@ -123,7 +126,6 @@ class Inside:
     signal_of: Callable[[str, Sequence[str]], Callable[[Any], Any]] | None
     model: Callable[[], Any] | None
     held: Callable[[], Sequence[str]]
-    guard: Guard
     halt: Callable[[], None]
     has_chosen: bool
     has_info: bool
@@ -131,6 +133,7 @@ class Inside:
     input_row: FloatArray
     input_writer: InputWriter
     interface: Interface
+    is_closed: bool
     is_finite: Callable[[Any], bool]
     no_action: Any
     no_monitors: bool
@@ -153,6 +156,7 @@ class Inside:
     renderer: Renderer[Any] | None
     scope: dict[str, str] | None
     spec: PoolSpec
+    standing_in: AbstractContextManager[Any]
     start_inputs: list[tuple[str, float]]
     step_limit: int
     step_pool: Callable[[], int]
@@ -162,10 +166,10 @@ class Inside:
     way: str
 
     def __init__(self, number: int) -> None:
-        self.guard = make_guard()
         self.number, self.own_names, self.way = number, frozenset(), "auto"
         self.pool_tells = self.has_info = self.has_chosen = False
-        self.in_hooks = self.was_reset = False
+        self.in_hooks = self.was_reset = self.is_closed = False
+        self.standing_in = RLock()
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
         self.future = self.controllers = self.signal_of = self.model = None
@@ -198,4 +202,4 @@ class Inside:
     def keep(self) -> None:
         """Keep what hooks read in an object of its own, not in the pool, until the next step."""
         if self.player is not None:
-            self.guard.run("this", self.player.keep, self)
+            self.player.keep(self)

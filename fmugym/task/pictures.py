@@ -8,7 +8,6 @@ import gymnasium
 
 from fmugym.checks import check_option
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.task.alone import alone
 from fmugym.task.hooks import Hooks
 
 if TYPE_CHECKING:
@@ -49,7 +48,6 @@ class Pictured(Hooks):
         )
         return None
 
-    @alone
     def render(self) -> Any:
         """Draw the current state.
 

@@ -144,8 +144,9 @@ def reading(env: Any, readings: Readings) -> Iterator[None]:
     The environment stays the same object. So objects and functions that it holds, and that refer
     to it, read the same values as its hooks.
     """
-    before, env.inside.readings = env.inside.readings, readings
-    try:
-        yield
-    finally:
-        env.inside.readings = before
+    with env.inside.standing_in:
+        before, env.inside.readings = env.inside.readings, readings
+        try:
+            yield
+        finally:
+            env.inside.readings = before

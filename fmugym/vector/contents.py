@@ -202,13 +202,14 @@ def borrowed(env: FMUEnv, outside: bool = False) -> Iterator[Contents]:
         env: The environment.
         outside: Whether this is to hold for global variables, too.
     """
-    before, env.inside.in_hooks = env.inside.in_hooks, True
-    contents = Contents(env, outside)
-    try:
-        yield contents
-    finally:
-        contents.restore()
-        env.inside.in_hooks = before
+    with env.inside.standing_in:
+        before, env.inside.in_hooks = env.inside.in_hooks, True
+        contents = Contents(env, outside)
+        try:
+            yield contents
+        finally:
+            contents.restore()
+            env.inside.in_hooks = before
 
 
 def _has_changed(kept: _Kept) -> bool:

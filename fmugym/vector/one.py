@@ -24,6 +24,7 @@ from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import attempt, compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
 from fmugym.vector.hooks.memory import Memory
+from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.purity import names_in_hooks, require_pure
 from fmugym.vector.hooks.trace import TracedTask
@@ -80,7 +81,7 @@ class Player:
 
     def __init__(self, env: FMUEnv) -> None:
         env.inside.keep()
-        self._env, self._guard = weakref.ref(env), env.inside.guard
+        self._env = weakref.ref(env)
         self._own = env.inside.readings
         self._pool: Any = env.inside.pool
         self._numbers: dict[str, npt.NDArray[Any]] = {}
@@ -116,7 +117,7 @@ class Player:
         self._may_change = [one for one in self._watched if one.copy is not None]
         watched = tuple(part for one in self._watched for part in one[:2])
         judge = partial(_judge_again, self._env)
-        self.step = partial(self._pool.step_one, self._guard, judge, self._complete, watched)
+        self.step = partial(self._pool.step_one, judge, self._complete, watched)
 
     def play(self, env: FMUEnv, action: Any) -> Result | None:
         """Let the pool do the whole step.
@@ -334,7 +335,7 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
     if changed is not None:
         raise UntraceableError(f"it changes {changed} outside of self")
     count = len(near.step_count)
-    with borrowed(env):
+    with exclusive, borrowed(env):  # in this order, as tracing does
         vars(env).update({name: np.repeat(number, count) for name, number in numbers.items()})
         task = compile_hooks(env, [near, far], numbers)
     if task.left:

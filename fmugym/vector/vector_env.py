@@ -16,7 +16,6 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 from fmugym.checks import check_count, check_misplaced, check_option
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray
-from fmugym.task.alone import alone
 from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
@@ -55,8 +54,7 @@ _SAME_STEP = AutoresetMode.SAME_STEP  # each look-up takes time
 class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     """N environments of one class, whose FMU instances step in one call.
 
-    One thread at a time may use them. A method that another thread calls meanwhile raises a
-    ``SimulationError``; only ``close`` waits.
+    They are for one thread, as a single environment is; see ``FMUEnv``.
 
     Seeded with ``s``, environment i reproduces a single environment seeded with ``s + i``, step by
     step and episode after episode.
@@ -190,11 +188,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
-        return self.inside.guard.run("reset", FMUVectorEnv._reset, self, misplaced, seed, options)
-
-    def _reset(
-        self, misplaced: tuple[object, ...], seed: Any, options: Mapping[str, Any] | None
-    ) -> tuple[Any, dict[str, Any]]:
         check_misplaced(misplaced)
         if self.closed or self._background.is_pending:
             require_open(self, "reset")
@@ -238,9 +231,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        return self.inside.guard.run("step", FMUVectorEnv._step, self, actions)
+        return self._step(actions)
 
-    @alone
     def step_around(self, actions: Any, resting: MaskArray) -> StepResult:
         """Step some environments, while the others stay as they are.
 
@@ -264,7 +256,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             self._interrupt()
             raise
 
-    @alone
     def step_async(self, actions: Any) -> None:
         """Begin a step of all environments, which goes on while the caller computes.
 
@@ -351,7 +342,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         infos = merged(restricted(result.infos, ~ended), infos)
         return result._replace(observations=observations, infos=infos)
 
-    @alone
     def render(self) -> tuple[Any, ...] | None:
         """Draw all environments.
 
@@ -368,7 +358,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     # Snapshots.
 
-    @alone
     def save_state(self, where: Any = None) -> Snapshot:
         """Save the episodes of environments at this moment; see ``FMUEnv.save_state``.
 
@@ -384,7 +373,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_ready("save_state", ended=True)
         return self.inside.episodes.save(chosen(where, self.num_envs))
 
-    @alone
     def restore_state(self, snapshot: Snapshot, where: Any = None) -> Any:
         """Let environments go on from a snapshot, with their random streams.
 
@@ -416,7 +404,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.inside.episodes.started = self.inside.episodes.is_ready = True
         return self.inside.engine.observe(indices)
 
-    @alone
     def rollout(
         self,
         snapshot: Snapshot | None,
@@ -472,7 +459,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     # Single environments.
 
-    @alone
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Read an attribute, or else a parameter of the FMU, of each environment.
 
@@ -483,7 +469,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         require_open(self, "get_attr")
         return tuple(self.inside.attributes.read(name, range(self.num_envs)))
 
-    @alone
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.
 
@@ -511,13 +496,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         vars(self)["spec"] = self.inside.limit.told_by(value)
 
     @property
-    @alone
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
         return tuple(self.inside.engine.seed_of(index) for index in range(self.num_envs))
 
     @property
-    @alone
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
         """The counters of each environment's FMU, arrays of shape (N,); see ``FMUEnv``.
 
@@ -527,7 +510,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         require_open(self, "health")
         return self.inside.pool.health()
 
-    @alone
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each environment, or read an attribute.
 
@@ -544,12 +526,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool, after waiting for a step that is under way."""
         if hasattr(self.inside, "engine"):  # otherwise the constructor has closed everything
-            with self.inside.guard:
-                self._background.stop()
-                try:
-                    self.inside.engine.close()
-                finally:
-                    self.inside.pool.close()
+            self._background.stop()
+            try:
+                self.inside.engine.close()
+            finally:
+                self.inside.pool.close()
 
     # Copies.
 

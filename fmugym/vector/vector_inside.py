@@ -8,7 +8,6 @@ from typing import Any
 
 from fmugym.env import FMUEnv
 from fmugym.pool import Pool
-from fmugym.task.alone import Guard, make_guard
 from fmugym.task.specs import EpisodeLimit
 from fmugym.vector.attributes import Attributes
 from fmugym.vector.engines.engine import Engine
@@ -23,7 +22,6 @@ class VectorInside:
     """What other modules need of a vector environment: its attribute ``inside``.
 
     Attributes:
-        guard: Lets one thread at a time call its methods.
         maker: Makes environments of its class.
         prototype: The first of these, whose task all have.
         pool: Has the FMUs.
@@ -38,14 +36,12 @@ class VectorInside:
     attributes: Attributes
     engine: Engine
     episodes: Episodes
-    guard: Guard
     limit: EpisodeLimit
     maker: EnvMaker
     pool: Pool
     prototype: FMUEnv
 
     def __init__(self) -> None:
-        self.guard = make_guard()
         self.at_ends = []
 
     def look_at_ends(self, look: Callable[[Any], None]) -> None:

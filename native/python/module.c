@@ -85,10 +85,8 @@ PyMODINIT_FUNC PyInit__native(void) {
         return NULL;
     }
     pool_prepare_process();
-    sleep_function = find_object("time", "sleep");
-    if (sleep_function == NULL || !handlers_prepare() || !add_type(module, &access_type, &access_spec) ||
+    if (!handlers_prepare() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
-        !add_type(module, &guard_type, &guard_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         !add_type(module, &snapshot_type, &snapshot_spec) ||
         PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {

@@ -5,8 +5,6 @@
 #include "handlers.h"
 #include "inside.h"
 
-PyObject *sleep_function;
-
 PyObject *find_object(const char *module_name, const char *name) {
     PyObject *module = PyImport_ImportModule(module_name);
     PyObject *found = module == NULL ? NULL : PyObject_GetAttrString(module, name);
@@ -16,11 +14,11 @@ PyObject *find_object(const char *module_name, const char *name) {
 }
 
 /* The package is not imported before: workers do without it. */
-void raise_simulation_error(const char *format, const char *name) {
+static void raise_closed(void) {
     PyObject *type = find_object("fmugym.errors", "SimulationError");
 
     if (type != NULL) {
-        PyErr_Format(type, format, name);
+        PyErr_SetString(type, "the pool is closed");
         Py_DECREF(type);
     }
 }
@@ -91,7 +89,7 @@ static bool is_short(const PyPool *self, int length) {
 
 bool explain_entry(Entry entry) {
     if (entry == ENTRY_CLOSED) {
-        raise_simulation_error("the %s is closed", "pool");
+        raise_closed();
     } else if (entry == ENTRY_INSIDE) {
         PyErr_SetString(PyExc_RuntimeError, "an FMU has called the pool that it is in");
     }

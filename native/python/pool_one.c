@@ -3,7 +3,7 @@
 #include "playing.h"
 
 /* The arguments of step_one; see Pool.step_one in fmugym/_native.pyi. */
-enum { GUARD, JUDGE, COMPLETE, WATCHED, ACTION, ENVIRONMENT, ARGUMENTS };
+enum { JUDGE, COMPLETE, WATCHED, ACTION, ENVIRONMENT, ARGUMENTS };
 
 typedef struct {
     PyTurn turn;
@@ -102,21 +102,16 @@ static PyObject *step_with(PyPool *self, const Playing *playing, PyObject *const
 
 PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
-    PyObject *result = NULL;
 
     if (!has_arguments(nargs, ARGUMENTS) || !is_prepared(self) || !has_results(self)) {
         return NULL;
     }
-    if (self->pool.settings.count != 1 || !PyObject_TypeCheck(args[GUARD], guard_type) ||
-        !PyTuple_Check(args[WATCHED])) {
-        PyErr_SetString(PyExc_TypeError, "step_one needs a guard, a tuple, one instance");
+    if (self->pool.settings.count != 1 || !PyTuple_Check(args[WATCHED])) {
+        PyErr_SetString(PyExc_TypeError, "step_one needs a tuple, one instance");
         return NULL;
     }
     PyObject *capsule = Py_NewRef(self->playing);
-    if (guard_take(args[GUARD], "step")) {
-        result = step_with(self, playing_of(capsule), args);
-        guard_give_back(args[GUARD]);
-    }
+    PyObject *result = step_with(self, playing_of(capsule), args);
     Py_DECREF(capsule);
     return result;
 }

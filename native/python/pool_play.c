@@ -213,7 +213,8 @@ static void settle_step(PyPool *self, const Playing *playing, bool starts, bool 
     }
 }
 
-/* Reads where episodes have ended before it enters the pool: only one thread may play at a time. */
+/* Reads where episodes have ended before it enters the pool. Those that another thread ends in between
+ * start with the values of earlier draws. */
 static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *actions,
                            bool at_ends) {
     const Playing *playing = playing_of(capsule);

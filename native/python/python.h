@@ -41,23 +41,14 @@ typedef struct {
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
 } PyPool;
 
-extern PyTypeObject *access_type, *draws_type, *guard_type, *snapshot_type;
-extern PyObject *sleep_function; /* that of Python, which signals interrupt */
-
-extern PyType_Spec access_spec, draws_spec, guard_spec, snapshot_spec, pool_spec;
-
-/* Takes a guard for a method. Returns false with an exception if another thread has it. */
-bool guard_take(PyObject *guard, const char *name);
-void guard_give_back(PyObject *guard);
+extern PyTypeObject *access_type, *draws_type, *snapshot_type;
+extern PyType_Spec access_spec, draws_spec, snapshot_spec, pool_spec;
 
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
 
 /* A new reference to an object of a module, or NULL with an exception. */
 PyObject *find_object(const char *module_name, const char *name);
-/* Raises a SimulationError of the package: by calls of a closed pool, and by guards. The format has a
- * place for a name. */
-void raise_simulation_error(const char *format, const char *name);
 
 PyObject *decode(const char *text);
 /* Takes the arguments of a new pool, all but the opening of it. Returns false with an exception. */

@@ -102,11 +102,13 @@ def run(sanitizer, folder, *command):
     return subprocess.run([sys.executable, *command], env=environment, cwd=folder).returncode
 
 
-def runs(seconds, seeds, systems):
+def runs(name, seconds, seeds, systems):
     """What is run: by name, the arguments of Python."""
     for seed in range(seeds):
         stress = str(HERE / "tools" / "native_stress.py"), str(seconds), str(seed)
-        yield f"seed {seed}", (*stress, *(["python"] if seed % 2 else []))
+        words = ["python"] if seed % 2 else []
+        words += ["in-turn"] if name == "thread" else []
+        yield f"seed {seed}", (*stress, *words)
     for what, count in (("systems", systems), ("forms", 10 * systems)):
         yield what, (str(HERE / "tools" / f"fuzz_{what}.py"), "--count", str(count))
 
@@ -121,7 +123,7 @@ def check(name, seconds, seeds, systems):
     clean = True
     with tempfile.TemporaryDirectory() as folder:
         build(sanitizer, Path(folder))
-        for what, command in runs(seconds, seeds, systems):
+        for what, command in runs(name, seconds, seeds, systems):
             begin = time.monotonic()
             status = run(sanitizer, Path(folder), *command)
             took = time.monotonic() - begin

@@ -25,7 +25,6 @@ from fmugym.pool.around import programs_for
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.requests import Answer, Request, request_listing
-from fmugym.task.alone import make_guard
 
 
 @pytest.fixture(name="make")
@@ -199,7 +198,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around, name)(actions, *more)
     with pytest.raises(ValueError, match="not prepared"):
-        around.step_one(make_guard(), int, None, (), 0, {})
+        around.step_one(int, None, (), 0, {})
     before = envs.inside.pool.outputs.copy()
     assert around.step_own() == 3
     nothing = _native.Access(form_of_listing(()))

@@ -20,7 +20,6 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
-from fmugym.task.alone import make_guard
 from fmugym.task.readings import READINGS
 from fmugym.vector import one as compiler
 
@@ -216,13 +215,12 @@ def test_observations_that_are_numbers():
 
 def test_a_pool_steps_one_environment_only_with_what_that_takes(make_envs):
     env, envs = with_hooks(Side, "compiled"), make_envs(Side, 2, hooks="compiled")
-    guard, action = make_guard(), np.zeros(1, np.float32)
-    good = [guard, int, None, (), action, env]
+    action = np.zeros(1, np.float32)
+    good = [int, None, (), action, env]
     env.reset(seed=1)
     envs.reset(seed=1)
-    for place, wrong in ((0, None), (3, [])):
-        with pytest.raises(TypeError, match="needs a guard"):
-            env.inside.pool.step_one(*good[:place], wrong, *good[place + 1 :])
+    with pytest.raises(TypeError, match="needs a tuple"):
+        env.inside.pool.step_one(int, None, [], action, env)
     with pytest.raises(TypeError, match="one instance"):
         envs.inside.pool.step_one(*good)
     assert env.inside.pool.step_one(*good) is None  # the environment keeps the episode itself
