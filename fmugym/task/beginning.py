@@ -112,8 +112,8 @@ class BeginningOfOne(Beginning):
         """See ``Beginning.clear``."""
         inside, episode = self.env.inside, self.episode
         if inside.player is not None:
-            inside.player.begin(inside)
-        read = inside.readings
+            inside.player.begin()
+        read = inside.readings = inside.own_readings
         read.parameters = episode.parameters
         if episode.variables:
             read.variables.update(episode.variables)

@@ -92,6 +92,7 @@ class Inside:
         held: Returns the outputs that a plant has not told now, whose last values go on.
         own: The hooks that the class has itself.
         readings: What hooks read now.
+        own_readings: What they read in an episode that Python steps.
         standing_in: Held while other values stand in for those that hooks read: threads that do so
             at once would put back each other's.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
@@ -145,6 +146,7 @@ class Inside:
     output_row: FloatArray
     own: OwnHooks
     own_names: frozenset[str]
+    own_readings: Readings
     pictured: tuple[float | None, float]
     draws: EpisodeDraws
     player: Any

@@ -82,7 +82,7 @@ class Player:
     def __init__(self, env: FMUEnv) -> None:
         env.inside.keep()
         self._env = weakref.ref(env)
-        self._own = env.inside.readings
+        self._own = env.inside.own_readings
         self._pool: Any = env.inside.pool
         self._numbers: dict[str, npt.NDArray[Any]] = {}
         self._compile(env)
@@ -178,9 +178,8 @@ class Player:
         for name in self._task.updated:
             own.variables[name] = _number_of(self._memory.variables[name][..., 0])
 
-    def begin(self, inside: Inside) -> None:
-        """Let the environment keep what hooks read, all of which an episode is about to set."""
-        inside.readings = self._own
+    def begin(self) -> None:
+        """Let the pool not step: Python begins an episode."""
         self._memory.ended[0] = True
 
     def go_back(self, inside: Inside) -> None:
