@@ -188,8 +188,10 @@ PyObject *py_undisturbed(PyObject *module, PyObject *args) {
 
 void handlers_hold_at_the_end(Held *held) {
     PyObject *first = NULL;
+    bool holds = handlers_hold(held);
 
-    while (!handlers_hold(held)) {
+    /* It fails once a signal, and always when Python itself ends: no handler runs then. */
+    for (int tries = 0; !holds && tries < MOST_SIGNALS; tries++) {
         PyObject *type, *value, *traceback;
 
         PyErr_Fetch(&type, &value, &traceback);
@@ -201,8 +203,14 @@ void handlers_hold_at_the_end(Held *held) {
         } else {
             Py_XDECREF(value);
         }
+        holds = handlers_hold(held);
     }
-    held->raised = first;
+    if (holds) {
+        held->raised = first;
+    } else {
+        PyErr_Clear();
+        Py_XDECREF(first);
+    }
 }
 
 static int raise(void *value) {
