@@ -1,6 +1,6 @@
 """Train PPO of TorchRL on the cart-pole FMU, with all environments in one batch.
 
-    pip install -e ".[torchrl]"
+    pip install torchrl
     python examples/train_torchrl.py
 
 TorchRL's collector, estimator and loss do the work; the environments step in one call of the
@@ -10,17 +10,18 @@ native pool. The program prints the mean return while it trains, and plays 100 e
 import argparse
 import time
 
+import gymnasium
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import RewardSum, TransformedEnv
+from torchrl.envs import GymWrapper, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from fmugym.torchrl import make_torchrl_env
+import fmugym  # noqa: F401  # registers the environments
 
 ENVS, STEPS, EPOCHS, BATCHES = 64, 32, 8, 4
 
@@ -32,7 +33,10 @@ def network(outputs: int) -> nn.Module:
 
 def make_env(seed: int) -> TransformedEnv:
     """64 cart-poles that also sum up their rewards."""
-    return TransformedEnv(make_torchrl_env("fmugym/CartPole-v0", ENVS, seed=seed), RewardSum())
+    envs = gymnasium.make_vec("fmugym/CartPole-v0", num_envs=ENVS, autoreset_mode="disabled")
+    env = GymWrapper(envs, categorical_action_encoding=True)
+    env.set_seed(seed)
+    return TransformedEnv(env, RewardSum())
 
 
 def train(actor: ProbabilisticActor, steps: int, seed: int) -> None:

@@ -9,7 +9,7 @@ from fmugym import vector
 HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.vector_env", "fmugym.envs")
 
 OPTIONAL = (
-    *("lab", "identification", "series", "search", "systems.ssp", "sb3", "torchrl", "rllib"),
+    *("lab", "identification", "series", "search", "systems.ssp", "sb3", "rllib"),
     *("pettingzoo", "export", "logs", "minari", "episodes", "repair", "training", "tools"),
 )
 
@@ -73,7 +73,7 @@ def test_other_names_are_refused(module):
 
 @pytest.mark.parametrize(
     ("module", "library"),
-    [("sb3", "stable_baselines3"), ("minari", "minari"), ("rllib", "ray"), ("torchrl", "torch")],
+    [("sb3", "stable_baselines3"), ("minari", "minari"), ("rllib", "ray")],
 )
 def test_a_missing_library_names_its_extra(module, library):
     program = f"import sys; sys.modules[{library!r}] = None; import fmugym.{module}"

@@ -36,7 +36,6 @@ MODULES: Final = {
     "Linear models": "fmugym.linearization",
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
-    "TorchRL": "fmugym.torchrl",
     "PettingZoo": "fmugym.pettingzoo",
     "RLlib": "fmugym.rllib",
     "Plant logs": "fmugym.logs",

@@ -60,10 +60,9 @@ LIBRARIES = {
     ),
     "TorchRL": Library(
         "torchrl",
-        'env = make_torchrl_env("fmugym/CartPole-v0", num_envs=8)',
+        'env = GymWrapper(make_vec("fmugym/CartPole-v0", num_envs=8, autoreset_mode="disabled"))',
         "assert env.rollout(50, break_when_any_done=False).batch_size == (8, 50)",
-        "from fmugym.torchrl import make_torchrl_env",
-        extra="torchrl",
+        "from gymnasium import make_vec\nfrom torchrl.envs import GymWrapper",
     ),
     "RLlib": Library(
         "ray",
