@@ -275,6 +275,33 @@ class PushedCartPole(fmugym.FMI2CSEnv):
         return abs(self.state[0]) > 2.4
 
 
+class Home(fmugym.FMUEnv):
+    """A house with a roof of solar cells and a battery, at a price that changes."""
+
+    def __init__(self, system):
+        config = {
+            "model_input_names": ["heating", "charging"],
+            "model_output_names": ["house.T_air", "battery.charge", "roof.P_pv", "grid"],
+            "model_parameters": {"house.T_m_0": Uniform(291.0, 294.0)},
+            "bounds": {"heating": (0.0, 1.0), "charging": (-1.0, 1.0)},
+            "time_step": 900.0,
+            "max_episode_steps": 96,
+        }
+        super().__init__(system, config)
+
+    def _is_done(self):
+        return False
+
+    def _reward_policy(self):
+        temperature, _, _, grid = self.state
+        hour = self.time / 3600 % 24
+        price = np.where((hour >= 17) & (hour < 22), 0.60, 0.20)
+        sold = np.minimum(grid, 0.0) * 0.06
+        cost = (np.maximum(grid, 0.0) * price + sold) * 900.0 / 3.6e6
+        cold = np.maximum(293.15 - temperature, 0.0)
+        return -cost - cold * 0.25
+
+
 # An integral, with ends that each episode draws.
 
 

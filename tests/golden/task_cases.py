@@ -22,11 +22,13 @@ import numpy as np
 import user_tasks
 import zoo_tools
 from building import compiler
+from busy import BusyEnv
 from export_tools import network_for
 from fmpy import extract, read_model_description
 from fmpy.simulation import instantiate_fmu
 from golden import classes, plays
 from golden.plays import MODES, NUM_ENVS, action_in, actions_in, labelled, of_each, plain
+from makers import by_python
 
 import fmugym
 from fmugym import Uniform
@@ -36,6 +38,7 @@ from fmugym.tools.cli import main
 TASKS = Path(__file__).with_name("tasks")
 BUNDLED = ("CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum", "House")
 OF_USERS = ("SwingUp", "Tracking", "Uncompiled", "Goal", "Building")
+PLANTS = ("drive.toml", "room.toml")
 LIMIT = 9
 """Steps of the longest episode in the cases of vector environments."""
 
@@ -56,13 +59,55 @@ def building(folder):
 
 
 @cache
+def busy(folder):
+    return c_fmus.build_busy(folder)
+
+
+@cache
 def zoo(folder):
     return zoo_tools.zoo_fmu(folder, 2)
+
+
+@cache
+def of_pythonfmu(script, folder, **options):
+    """The FMU of a script; without pythonfmu, the test is skipped."""
+    return by_python("pythonfmu", script, **options)(folder)
+
+
+@cache
+def home(folder):
+    """A house in C, with a roof and a battery in Python."""
+    battery = of_pythonfmu(TASKS.with_name("golden_battery.py"), folder)
+    return fmugym.FMUSystem(
+        {
+            "roof": of_pythonfmu(TASKS.with_name("golden_roof.py"), folder),
+            "house": fmugym.bundled_fmu("House"),
+            "battery": fmugym.Component(battery, feedthrough=False),
+        },
+        [
+            "roof.T_out -> house.T_out",
+            "roof.I_sol -> house.I_sol",
+            "roof.P_pv -> battery.P_pv",
+            "house.P -> battery.P_house",
+            "heating -> house.u",
+            "charging -> battery.command",
+            "battery.P_grid -> grid",
+        ],
+        name="house with battery",
+        step_size=900.0,
+    )
 
 
 def of_file(name, folder, **options):
     """The environment of a task file."""
     return fmugym.load(files(folder) / name, **options)
+
+
+def of_plant(name, folder):
+    """The environment of a task file over a plant of the benchmarks in Python."""
+    script = Path(c_fmus.__file__).with_name(f"plant_{Path(name).stem}.py")
+    of_pythonfmu(script, files(folder), canGetAndSetFMUstate="true")
+    return of_file(name, folder)
 
 
 def of_id(name, folder):
@@ -80,6 +125,16 @@ def of_user(name, folder):
     return getattr(user_tasks, name)(*[building(folder)] * (name == "Building"))
 
 
+def of_busy(folder):
+    """What the benchmarks do over steps that take long: here 20 us, or 50 us."""
+    return BusyEnv(busy(folder), mean=20.0, sigma=0.5, rare=0.2, rare_time=50.0)
+
+
+def of_home(folder):
+    """An example's house with solar cells and a battery."""
+    return classes.Home(home(folder))
+
+
 OF_PAGES = (
     *("BrakeOfPage", "BrakeOfExample", "Brake", "Discretized", "Track", "Delayed", "Reach"),
     *("Houses", "SwingUpOfExample", "Cell", "PushedCartPole"),
@@ -92,7 +147,9 @@ def makers():
     found = {name: partial(of_id, name) for name in BUNDLED}
     found |= {f"{name} of users": partial(of_user, name) for name in OF_USERS}
     found |= {name: partial(of_class, name) for name in OF_PAGES}
-    return found | {path.name: partial(of_file, path.name) for path in sorted(TASKS.glob("*.toml"))}
+    found |= {"Busy": of_busy, "Home": of_home}
+    found |= {path.name: partial(of_file, path.name) for path in sorted(TASKS.glob("*.toml"))}
+    return found | {name: partial(of_plant, name) for name in PLANTS}
 
 
 # Steps and resets.
