@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
+from operator import attrgetter
 from typing import Any, Final
 
 from fmpy.validation import validate_model_description
@@ -32,6 +33,10 @@ _MOST_EQUATIONS: Final = 1_000_000
 _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
+_SHARED: Final = attrgetter(
+    "type", "causality", "variability", "unit", "declaredType", "min", "max", "nominal", "shape"
+)
+"""Attributes of FMPy's variables that are the same for many."""
 
 _OPPOSITES: Final = {"Real", "Integer", "Boolean"}
 """The types of FMI 1.0 whose values can be negated."""
@@ -56,7 +61,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     experiment = source.defaultExperiment
     capabilities = _capabilities(source, root, interface, offer)
     pairs = list(_with_elements(source, root))
-    variables = [_convert_variable(*pair) for pair in pairs]
+    variables = _variables(pairs)
     namesakes = _namesakes(variables)
     return ModelDescription(
         fmi_version=source.fmiVersion,
@@ -75,7 +80,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         variables={v.name: v for v in variables if v.name not in namesakes},
         namesakes=namesakes,
         derivatives=_derivatives(source, namesakes),
-        findings=_findings(source) + _of_aliases(pairs),
+        findings=_findings(source) + _of_aliases(source, pairs),
         error_categories=_error_categories(root),
         units=_units(root),
         interface=interface,
@@ -100,12 +105,10 @@ def _with_elements(source: Any, root: Any) -> Iterator[tuple[Any, Any]]:
 
     Names may come twice.
     """
-    named = (element for element in root.find("ModelVariables") if element.get("name") is not None)
     own = [variable for variable in source.modelVariables if variable.alias is None]
-    elements = {id(v): element for v, element in zip(own, named, strict=True)}
+    elements = dict(zip(own, root.xpath("ModelVariables[1]/*[@name]"), strict=True))
     for variable in source.modelVariables:
-        origin = variable if variable.alias is None else variable.alias
-        yield variable, elements[id(origin)]
+        yield variable, elements[variable.alias or variable]
 
 
 def _namesakes(variables: Sequence[Variable]) -> dict[str, tuple[Variable, ...]]:
@@ -268,25 +271,49 @@ def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
     )
 
 
-def _convert_variable(source: Any, element: Any) -> Variable:
-    _check_reference(source)
+def _variables(pairs: Iterable[tuple[Any, Any]]) -> list[Variable]:
+    """Convert the variables; only one of those that differ in nothing but ``OWN`` takes time."""
+    templates: dict[Any, Variable] = {}
+    variables = []
+    for source, element in pairs:
+        key = _what_is_shared(source, element)
+        template = templates.get(key)
+        if template is None:
+            template = templates[key] = _template(source, element)
+        own = (source.name, _reference(source), source.start, source.description or "")
+        variables.append(template.sibling(*own))
+    return variables
+
+
+def _what_is_shared(source: Any, element: Any) -> tuple[Any, ...]:
+    """All that ``_template`` reads, but for arrays and clocks, which have a template each."""
     if source.type.startswith("UInt"):  # of which FMPy leaves out the limits
         source.min, source.max = element.get("min"), element.get("max")
+    return (
+        _SHARED(source),
+        _initial(source),
+        _is_relative(source, element),
+        element.get("clocks"),
+        element.get("alias"),
+        source if source.dimensions or source.type == "Clock" else None,
+    )
+
+
+def _template(source: Any, element: Any) -> Variable:
+    """A variable without a name, whose siblings are like FMPy's variable."""
     ticking = _ticking(source, element)
     return Variable(
-        name=source.name,
+        name="",
         type=source.type,
-        value_reference=int(source.valueReference),
+        value_reference=0,
         causality=source.causality,
         variability=source.variability,
         initial=_initial(source),
-        start=source.start,
         unit=_inherited(source, "unit", str) or None,
         relative=_is_relative(source, element),
         minimum=_bound(source, "min", -math.inf),
         maximum=_bound(source, "max", math.inf),
         nominal=_nominal(source),
-        description=source.description or "",
         items=_items(source),
         shape=_shape(source),
         dimensions=tuple(
@@ -296,7 +323,7 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         ticking=ticking,
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
         shift=_shift(source, element, ticking) if ticking else UNKNOWN,
-        by_fractions=_is_set(element, "supportsFraction"),
+        by_fractions=bool(ticking) and _is_set(element, "supportsFraction"),
         negated=element.get("alias") == "negatedAlias" and source.type in _OPPOSITES,
     )
 
@@ -347,12 +374,14 @@ def _fraction_part(source: Any, attribute: str, text: str, least: int) -> int:
     return int(text)
 
 
-def _check_reference(source: Any) -> None:
-    if int(source.valueReference) not in _REFERENCES:
+def _reference(source: Any) -> int:
+    reference = int(source.valueReference)
+    if reference not in _REFERENCES:
         raise FMULoadError(
             f"variable {source.name!r} has the value reference {source.valueReference}, expected "
             f"0 to {_REFERENCES[-1]}"
         )
+    return reference
 
 
 def _initial(source: Any) -> str | None:
@@ -372,9 +401,10 @@ def _inherited(source: Any, attribute: str, convert: Callable[[str], Any]) -> An
 
 def _is_relative(source: Any, element: Any) -> bool:
     """Whether a variable or its type is relative; FMPy does not find it at variables."""
-    for one in (element, *element):  # before FMI 3.0 it stands below the variable
-        if one.get("relativeQuantity") is not None:
-            return one.get("relativeQuantity") in {"true", "1"}
+    places = element if source.type == "Real" else (element,)  # below it before FMI 3.0
+    for place in places:
+        if place.get("relativeQuantity") is not None:
+            return place.get("relativeQuantity") in {"true", "1"}
     return bool(getattr(source.declaredType, "relativeQuantity", False))
 
 
@@ -406,8 +436,10 @@ def _findings(source: Any) -> tuple[str, ...]:
     return experiment + internal + _broken_rules(source)
 
 
-def _of_aliases(pairs: Iterable[tuple[Any, Any]]) -> tuple[str, ...]:
-    """The findings on aliases of FMI 1.0."""
+def _of_aliases(source: Any, pairs: Iterable[tuple[Any, Any]]) -> tuple[str, ...]:
+    """The findings on aliases of FMI 1.0; later versions have no negated ones."""
+    if source.fmiVersion != "1.0":
+        return ()
     return tuple(
         f"{variable.name!r} is a negated alias of type {variable.type}, which has no negation: its "
         "value is taken as it is"

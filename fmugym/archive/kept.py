@@ -13,8 +13,7 @@ import logging
 import math
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields, replace
-from itertools import chain, groupby, repeat
+from dataclasses import asdict, fields
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +21,7 @@ from typing import Any, Final
 import fmpy
 
 from fmugym.archive.description import Capabilities, ModelDescription, ModelExchange, Unit
-from fmugym.archive.variable import UNKNOWN, Interval, Variable
+from fmugym.archive.variable import OWN, UNKNOWN, Interval, Variable
 from fmugym.caching import cache_folder, read_file, replace_file
 
 __all__ = ["keep", "kept"]
@@ -32,13 +31,6 @@ logger = logging.getLogger(__name__)
 _FOLDER: Final = "descriptions"
 _LARGEST: Final = 2**28
 """Bytes that a file may have, and its text."""
-
-_COLUMNS: Final = tuple(
-    field.name
-    for field in fields(Variable)
-    if field.name not in {"array", "place", "driven", "bounds", "sampling", "interval", "shift"}
-)
-"""What is kept of each variable: what a model description says, but for the times of clocks."""
 
 _SIMPLE: Final = tuple(
     field.name
@@ -105,29 +97,15 @@ def _plain(description: ModelDescription) -> dict[str, Any]:
 
 
 def _table(variables: Iterable[Variable]) -> dict[str, Any]:
-    """The columns of variables, and the times of the clocks among them by their rows."""
+    """What each variable has of its own, and the number of what it shares with its siblings."""
     rows = list(variables)
-    clocks = {row: v for row, v in enumerate(rows) if v.ticking}
+    shared = {id(variable.shared): variable.shared for variable in rows}
+    numbers = {identity: number for number, identity in enumerate(shared)}
     return {
-        "columns": [_runs_of(map(attrgetter(name), rows)) for name in _COLUMNS],
-        "times": {row: [v.interval, v.shift] for row, v in clocks.items()},
+        "own": [list(map(attrgetter(name), rows)) for name in OWN],
+        "numbers": [numbers[id(variable.shared)] for variable in rows],
+        "shared": list(shared.values()),
     }
-
-
-def _runs_of(values: Iterable[Any]) -> list[list[Any]]:
-    """Equal neighbours once, and how many each are; no numbers where no neighbours are equal.
-
-    Most variables differ in little but the name.
-    """
-    groups = [list(group) for _, group in groupby(values, lambda one: one or repr(one))]
-    counts = list(map(len, groups))
-    return [[group[0] for group in groups], counts if any(n > 1 for n in counts) else []]
-
-
-def _values_of(values: list[Any], counts: list[int]) -> Iterable[Any]:
-    """What ``_runs_of`` has shortened."""
-    frozen = map(_frozen, values)
-    return chain.from_iterable(map(repeat, frozen, counts)) if counts else frozen
 
 
 def _description_of(plain: dict[str, Any]) -> ModelDescription:
@@ -148,13 +126,15 @@ def _description_of(plain: dict[str, Any]) -> ModelDescription:
 
 
 def _variables_of(table: dict[str, Any]) -> list[Variable]:
-    columns = [_values_of(*runs) for runs in table["columns"]]
-    rows = zip(*columns, strict=True)
-    variables = [Variable(**dict(zip(_COLUMNS, row, strict=True))) for row in rows]
-    for row, times in table["times"].items():
-        interval, shift = map(_time_of, times)
-        variables[int(row)] = replace(variables[int(row)], interval=interval, shift=shift)
-    return variables
+    templates = [_template_of(shared) for shared in table["shared"]]
+    rows = zip(table["numbers"], *table["own"], strict=True)
+    return [templates[number].sibling(*own) for number, *own in rows]
+
+
+def _template_of(shared: dict[str, Any]) -> Variable:
+    attributes = {name: _frozen(value) for name, value in shared.items()}
+    times = {name: _time_of(attributes[name]) for name in ("interval", "shift")}
+    return Variable(name="", value_reference=0, **(attributes | times))
 
 
 def _time_of(time: Sequence[Any]) -> Interval:

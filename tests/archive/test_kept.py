@@ -57,10 +57,14 @@ def same(one, other):
     pairs = list(zip(one.everything, other.everything, strict=True))
     assert pairs
     for first, second in pairs:
-        for field in fields(first):
-            values = getattr(first, field.name), getattr(second, field.name)
-            assert repr(values[0]) == repr(values[1]), (first.name, field.name)
-            assert type(values[0]) is type(values[1])
+        same_variable(first, second)
+
+
+def same_variable(first, second):
+    for field in fields(first):
+        values = getattr(first, field.name), getattr(second, field.name)
+        assert repr(values[0]) == repr(values[1]), (first.name, field.name)
+        assert type(values[0]) is type(values[1])
 
 
 def test_the_second_reading_parses_nothing(cache, path, unread):
@@ -116,6 +120,57 @@ def test_every_kind_of_description_comes_back(cache, tmp_path):
         kept.keep(str(number), description)
     for number, description in enumerate(descriptions):
         same(description, kept.kept(str(number)))
+
+
+DIFFERENT = {
+    2: [
+        '<ScalarVariable name="v" valueReference="900" causality="local" variability="{}">'
+        "<{}/></ScalarVariable>".format(*one)
+        for one in [
+            ("continuous", "Real"),
+            ("discrete", "Real"),
+            ("discrete", "Integer"),
+            ("continuous", 'Real min="0"'),
+            ("continuous", 'Real min="-0"'),
+            ("continuous", 'Real max="0"'),
+            ("continuous", 'Real nominal="2"'),
+            ("continuous", 'Real unit="K"'),
+            ("continuous", 'Real relativeQuantity="true"'),
+            ("continuous", 'Real relativeQuantity="false"'),
+            ("discrete", 'Enumeration declaredType="Mode"'),
+        ]
+    ],
+    3: [
+        f'<{one} name="v" valueReference="900" causality="local" variability="discrete"'
+        f"{more}</{one.split()[0]}>"
+        for one, more in [
+            ("Float64", ">"),
+            ("UInt8", ">"),
+            ("UInt8", ' max="3">'),
+            ("Float64", ' relativeQuantity="true">'),
+            ("Float64", '><Dimension start="1"/>'),
+            ("Float64", '><Dimension start="2"/>'),
+        ]
+    ],
+}
+"""Variables that differ in one thing."""
+
+
+@pytest.mark.parametrize("version", DIFFERENT)
+def test_variables_that_are_nearly_the_same_stay_apart(cache, tmp_path, version):
+    """They are alone in a description, and then together."""
+
+    def described(*rows):
+        more = {"</ModelVariables>": f"{''.join(rows)}</ModelVariables>"}
+        return FMU(probe_fmu(tmp_path, version, more)).description
+
+    rows = DIFFERENT[version]
+    alone = [described(row).variables["v"] for row in rows]
+    together = described(*rows)
+    kept.keep("together", together)
+    for description in (together, kept.kept("together")):
+        for one, other in zip(alone, description.namesakes["v"], strict=True):
+            same_variable(one, other)
 
 
 def damages():
