@@ -21,6 +21,7 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 
+from fmugym.archive.texts import values_by_name
 from fmugym.archive.units import conversion_of
 from fmugym.archive.variable import Variable
 from fmugym.env import inner_env
@@ -130,10 +131,9 @@ class _Plant:
         self.env, self._columns = inner_env(env), columns
         draws = self.env.inside.draws
         typical = np.median(draws.draw_starts(np.random.default_rng(0), 101), axis=1).tolist()
-        pairs = zip(draws.model_variables, typical, strict=True)
-        given = {v.name: value for v, value in pairs if not is_start_time(v)}
-        self.given: dict[str, Any] = given | {
-            name: value for name, value in draws.constants_shown.items() if name in draws.strings
+        given = values_by_name(draws.model_variables, typical)
+        self.given: dict[str, Any] = {
+            v.name: given[v.name] for v in draws.model_variables if not is_start_time(v)
         }
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:

@@ -25,32 +25,36 @@ static bool are_sound(const char *types, const char *elements, size_t count, siz
     return true;
 }
 
-/* The first byte after a text, or NULL if the text does not end. */
-static const char *end_of_text(const char *entry, size_t left) {
-    const char *end = left < sizeof(double) ? NULL
-                                            : memchr(entry + sizeof(double), 0, left - sizeof(double));
-    return end == NULL ? NULL : end + 1;
+static size_t count_of(const char *counts, size_t string) {
+    uint32_t count;
+    memcpy(&count, counts + string * sizeof count, sizeof count);
+    return count;
 }
 
-static bool texts_are_sound(Block texts) {
-    const char *end = texts.bytes + texts.size;
-    double last = -1.0, number;
+/* There are as many texts as the Strings of the list may get, and the last one ends. */
+static bool texts_are_sound(const Listing *listing, Block counts) {
+    const Block texts = listing->texts;
+    uint64_t wanted = 0, found = 0;
+    size_t strings = 0;
 
-    for (const char *entry = texts.bytes; entry != end; last = number) {
-        const char *next = end_of_text(entry, (size_t)(end - entry));
-        if (next == NULL) {
-            return false;
-        }
-        memcpy(&number, entry, sizeof number);
-        if (!(number > last)) {
-            return false;
-        }
-        entry = next;
+    for (size_t i = 0; i < listing->count; i++) {
+        strings += listing->types[i] == TYPE_STRING;
     }
-    return true;
+    if (counts.size != strings * sizeof(uint32_t) ||
+        (texts.size > 0 && texts.bytes[texts.size - 1] != '\0')) {
+        return false;
+    }
+    for (size_t i = 0; i < strings; i++) {
+        wanted += count_of(counts.bytes, i);
+    }
+    for (size_t i = 0; i < texts.size; i++) {
+        found += texts.bytes[i] == '\0';
+    }
+    return found == wanted;
 }
 
-const char *listing_take(Listing *listing, Block types, Block elements, Block rest, Block texts) {
+const char *listing_take(Listing *listing, Block types, Block elements, Block rest, Block counts,
+                         Block texts) {
     const size_t count = types.size, number_of_rest = rest.size / sizeof(double);
 
     if (elements.size != count * sizeof(Element) || rest.size % sizeof(double) != 0 ||
@@ -58,9 +62,9 @@ const char *listing_take(Listing *listing, Block types, Block elements, Block re
         return "the parts of a list of variables differ in length";
     }
     *listing = (Listing){(const uint8_t *)types.bytes, elements.bytes, count - number_of_rest,
-                         rest.bytes, number_of_rest, texts.bytes, texts.size};
-    if (!texts_are_sound(texts)) {
-        return "the texts of a list of variables have no order, or do not end";
+                         rest.bytes, number_of_rest, counts.bytes, texts};
+    if (!texts_are_sound(listing, counts)) {
+        return "the texts of a list of variables differ in number, or do not end";
     }
     return are_sound(types.bytes, elements.bytes, count, listing->count)
                ? NULL
@@ -85,11 +89,12 @@ static bool allocate(Access *access, const Listing *listing) {
     access->types = malloc(all + 1);
     access->rest = malloc((listing->number_of_rest + 1) * sizeof *access->rest);
     access->memory = malloc((4 * all + 1) * sizeof *access->memory);
-    access->letters = malloc(listing->size_of_texts + 1);
-    access->texts = malloc((listing->size_of_texts / (sizeof(double) + 1) + 1) *
-                           sizeof *access->texts);
+    access->first_texts = malloc((listing->count + 1) * sizeof *access->first_texts);
+    access->texts = malloc((listing->texts.size + 1) * sizeof *access->texts);
+    access->letters = malloc(listing->texts.size + 1);
     if (access->variables == NULL || access->types == NULL || access->rest == NULL ||
-        access->memory == NULL || access->letters == NULL || access->texts == NULL) {
+        access->memory == NULL || access->first_texts == NULL || access->texts == NULL ||
+        access->letters == NULL) {
         access_close(access);
         return false;
     }
@@ -100,14 +105,19 @@ static bool allocate(Access *access, const Listing *listing) {
 }
 
 static void keep_texts(Access *access, const Listing *listing) {
-    memcpy(access->letters, listing->texts, listing->size_of_texts);
-    const char *end = access->letters + listing->size_of_texts;
+    const char *letter = access->letters;
+    size_t next = 0, string = 0;
 
-    for (const char *entry = access->letters; entry != end;) {
-        Text *text = &access->texts[access->number_of_texts++];
-        memcpy(&text->number, entry, sizeof text->number);
-        text->text = entry + sizeof text->number;
-        entry = end_of_text(entry, (size_t)(end - entry));
+    if (listing->texts.size > 0) {
+        memcpy(access->letters, listing->texts.bytes, listing->texts.size);
+    }
+    for (size_t i = 0; i < listing->count; i++) {
+        access->first_texts[i] = next;
+        next += access->types[i] == TYPE_STRING ? count_of(listing->counts, string++) : 0;
+    }
+    access->first_texts[listing->count] = next;
+    for (size_t i = 0; i < next; i++, letter += strlen(letter) + 1) {
+        access->texts[i] = letter;
     }
 }
 
@@ -230,8 +240,10 @@ void access_close(Access *access) {
     free(access->types);
     free(access->rest);
     free(access->memory);
-    free(access->texts);
+    free(access->first_texts);
+    free((void *)access->texts);
     free(access->letters);
+    access->first_texts = NULL;
     access->texts = NULL;
     access->letters = NULL;
     access->variables = NULL;
@@ -419,9 +431,10 @@ Status variable_set(const Fmi *fmi, const Library *library, void *component, Typ
     return status;
 }
 
-static int compare_numbers(const void *number, const void *text) {
-    const double wanted = *(const double *)number, found = ((const Text *)text)->number;
-    return (wanted > found) - (wanted < found);
+const char *access_text(const Access *access, size_t variable, double value) {
+    const size_t first = access->first_texts[variable];
+    const size_t count = access->first_texts[variable + 1] - first;
+    return value >= 0.0 && value < (double)count ? access->texts[first + (size_t)value] : NULL;
 }
 
 Status access_set_texts(const Access *access, const Library *library, void *component,
@@ -432,13 +445,11 @@ Status access_set_texts(const Access *access, const Library *library, void *comp
         if (access->types[i] != TYPE_STRING) {
             continue;
         }
-        const Text *text = bsearch(&values[i], access->texts, access->number_of_texts,
-                                   sizeof *text, compare_numbers);
+        const char *text = access_text(access, i, values[i]);
         const Status status = text == NULL
                                   ? STATUS_ERROR
                                   : access->fmi->set_string(library, component,
-                                                            access->variables[i].reference,
-                                                            text->text);
+                                                            access->variables[i].reference, text);
         worst = status > worst ? status : worst;
         floats_restore_if_seen(floats);
         *refused = status > STATUS_WARNING ? access->variables[i].reference : *refused;

@@ -23,12 +23,6 @@ typedef struct {
     uint32_t *places;    /* in the FMU's memory */
 } Part;
 
-/* A text that a String may start with, and the number that stands for it. */
-typedef struct {
-    double number;
-    const char *text;
-} Text;
-
 /* The variables of one C type. An array is moved as a whole, so there is one value reference for
  * all of its elements. */
 typedef struct {
@@ -49,12 +43,17 @@ typedef struct Access {
     Element *variables; /* in the order of the list */
     uint8_t *types;
     double *rest;     /* the values of the elements that are not listed */
-    Text *texts;      /* those that Strings may get, by ascending number */
-    size_t number_of_texts;
-    char *letters;    /* of the texts */
+    size_t *first_texts; /* of each variable, where its texts begin; where the last ones end */
+    const char **texts;  /* those that Strings may get */
+    char *letters;       /* of the texts */
     uint32_t *memory; /* of all groups */
     Group groups[NUMBER_OF_TYPES];
 } Access;
+
+typedef struct {
+    const char *bytes;
+    size_t size;
+} Block;
 
 /* What an access is made of. The variables that follow the list are the elements that are missing
  * in it: FMI sets whole arrays only. */
@@ -64,8 +63,8 @@ typedef struct {
     size_t count;         /* of the list */
     const char *rest;     /* the values of the other elements: doubles, not aligned */
     size_t number_of_rest;
-    const char *texts;    /* numbers, doubles that ascend, each followed by its text and a NUL */
-    size_t size_of_texts;
+    const char *counts;   /* uint32_t, not aligned: how many texts each String of the list may get */
+    Block texts;          /* all of them, each with a zero at its end */
 } Listing;
 
 /* Whether a byte is a Type or START_TIME. */
@@ -75,12 +74,8 @@ static inline bool is_type(uint8_t type) {
 
 /* Checks blocks of bytes and takes a listing from them, which refers to them. Returns what is wrong
  * with them, or NULL. */
-typedef struct {
-    const char *bytes;
-    size_t size;
-} Block;
-
-const char *listing_take(Listing *listing, Block types, Block elements, Block rest, Block texts);
+const char *listing_take(Listing *listing, Block types, Block elements, Block rest, Block counts,
+                         Block texts);
 
 /* Groups the variables by type, in the order in which the types first appear. The start time belongs
  * to no group. Returns whether there was enough memory. */
@@ -109,7 +104,10 @@ Status access_get(const Access *access, const Library *library, void *component,
 Status access_set(const Access *access, const Library *library, void *component,
                   const double *values, void *typed, const Floats *floats);
 
-/* Sets the Strings, whose values are the numbers of their texts. Of one that is refused, sets refused to the value reference. */
+/* The text of a variable for which a value stands, its place among those that a String may get; NULL
+ * if there is none. */
+const char *access_text(const Access *access, size_t variable, double value);
+/* Sets the Strings. Of one that is refused, sets refused to the value reference. */
 Status access_set_texts(const Access *access, const Library *library, void *component,
                         const double *values, const Floats *floats, uint32_t *refused);
 

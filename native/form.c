@@ -125,14 +125,15 @@ const Fmi *read_fmi(Reader *reader) {
 
 bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
     const Block types = read_block(reader), elements = read_block(reader);
-    const Block rest = read_block(reader), texts = read_block(reader);
+    const Block rest = read_block(reader), counts = read_block(reader);
+    const Block texts = read_block(reader);
     Listing listing;
 
     memset(access, 0, sizeof *access);
     if (reader->fault != NULL) {
         return false;
     }
-    const char *fault = listing_take(&listing, types, elements, rest, texts);
+    const char *fault = listing_take(&listing, types, elements, rest, counts, texts);
     if (fault != NULL) {
         return reader_refuse(reader, fault);
     }

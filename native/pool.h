@@ -142,8 +142,9 @@ typedef struct Snapshot {
 
 /* A value that was set before initialization. */
 typedef struct {
-    double value;
-    uint32_t type, reference, place, unused; /* place: see Element */
+    double value; /* 0 for a String */
+    uint32_t type, reference, place; /* place: see Element */
+    uint32_t size; /* of a String, of its text with the zero at its end */
 } RecordedStart;
 
 /* The episodes of all instances so far; see records.h. */

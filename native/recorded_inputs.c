@@ -15,6 +15,8 @@ enum {
 typedef struct {
     RecordedStart *values;
     size_t count;
+    char *texts; /* of the Strings among them, in their order */
+    size_t size; /* of the texts */
 } Starts;
 
 /* A row has the inputs of a step of all instances. Each counts the steps of its own episode, but most
@@ -42,6 +44,7 @@ static Records *make_records(size_t count, size_t width) {
 static void free_records(Records *r) {
     for (size_t i = 0; i < r->count && r->starts != NULL; i++) {
         free(r->starts[i].values);
+        free(r->starts[i].texts);
     }
     for (size_t k = 0; k < BLOCKS; k++) {
         free((void *)(uintptr_t)atomic_get(&r->blocks[k]));
@@ -76,8 +79,20 @@ void records_close(Pool *pool) {
 static void note_starts(RecordedStart *values, const Access *start, const double *starts) {
     for (size_t i = 0; i < start->count; i++) {
         const Element *variable = &start->variables[i];
-        values[i] = (RecordedStart){starts[i], start->types[i], variable->reference,
-                                    variable->place, 0};
+        const char *text = access_text(start, i, starts[i]);
+        const bool is_string = start->types[i] == TYPE_STRING;
+        values[i] = (RecordedStart){is_string ? 0.0 : starts[i], start->types[i],
+                                    variable->reference, variable->place,
+                                    text == NULL ? 0 : (uint32_t)strlen(text) + 1};
+    }
+}
+
+static void note_texts(const RecordedStart *values, const Access *start, const double *starts,
+                       char *to) {
+    for (size_t i = 0; i < start->count; to += values[i].size, i++) {
+        if (values[i].size > 0) {
+            memcpy(to, access_text(start, i, starts[i]), values[i].size);
+        }
     }
 }
 
@@ -94,13 +109,35 @@ static RecordedStart *room_for_starts(Records *r, size_t index, size_t count) {
     return own->values;
 }
 
+/* The memory for the texts of an instance, whose sizes its start values tell; NULL if there is none. */
+static char *room_for_texts(Records *r, size_t index) {
+    Starts *own = &r->starts[index];
+    size_t size = 0;
+
+    for (size_t i = 0; i < own->count; i++) {
+        size += own->values[i].size;
+    }
+    if (own->size != size || own->texts == NULL) {
+        free(own->texts);
+        own->texts = malloc(size + 1);
+        own->size = size;
+    }
+    r->rows[index] = own->texts == NULL ? NOT_WHOLE : r->rows[index];
+    return own->texts;
+}
+
 void record_begin(Pool *pool, size_t index, const Access *start, const double *starts) {
     if (pool->records == NULL) {
         return;
     }
     RecordedStart *values = room_for_starts(pool->records, index, start->count);
-    if (values != NULL) {
-        note_starts(values, start, starts);
+    if (values == NULL) {
+        return;
+    }
+    note_starts(values, start, starts);
+    char *texts = room_for_texts(pool->records, index);
+    if (texts != NULL) {
+        note_texts(values, start, starts, texts);
     }
 }
 
@@ -179,7 +216,7 @@ size_t record_size(const Pool *pool, size_t index, int64_t *starts, int64_t *row
 
     *starts = (int64_t)r->starts[index].count;
     *rows = (int64_t)r->rows[index];
-    return r->starts[index].count * sizeof(RecordedStart) +
+    return r->starts[index].count * sizeof(RecordedStart) + r->starts[index].size +
            r->rows[index] * r->width * sizeof(double);
 }
 
@@ -190,19 +227,29 @@ void record_write(const Pool *pool, size_t index, char *to) {
 
     memcpy(to, r->starts[index].values, size);
     to += size;
+    memcpy(to, r->starts[index].texts, r->starts[index].size);
+    to += r->starts[index].size;
     for (size_t row = 0; row < r->rows[index] && row_size > 0; row++, to += row_size) {
         memcpy(to, row_of(r, row) + index * r->width, row_size);
     }
 }
 
-bool record_fits(const Pool *pool, int64_t starts, int64_t rows, size_t size) {
+bool record_fits(const Pool *pool, int64_t starts, int64_t rows, const char *bytes, size_t size) {
     const Records *r = pool->records;
 
     if (r == NULL || starts < 0 || (uint64_t)starts > size / sizeof(RecordedStart) || rows < 0) {
         return false;
     }
-    const size_t rest = size - (size_t)starts * sizeof(RecordedStart);
+    size_t rest = size - (size_t)starts * sizeof(RecordedStart);
     const size_t row_size = r->width * sizeof(double);
+    for (int64_t i = 0; i < starts; i++, bytes += sizeof(RecordedStart)) {
+        RecordedStart one;
+        memcpy(&one, bytes, sizeof one);
+        if (one.size > rest) {
+            return false;
+        }
+        rest -= one.size;
+    }
     return row_size == 0 ? rest == 0 : rest % row_size == 0 && (uint64_t)rows == rest / row_size;
 }
 
@@ -216,6 +263,12 @@ void record_put(Pool *pool, size_t index, size_t starts, size_t rows, const char
     }
     memcpy(values, from, starts * sizeof *values);
     from += starts * sizeof *values;
+    char *texts = room_for_texts(r, index);
+    if (texts == NULL) {
+        return;
+    }
+    memcpy(texts, from, r->starts[index].size);
+    from += r->starts[index].size;
     for (size_t row = 0; row < rows; row++, from += row_size) {
         double *to = row_of(r, row);
         if (to == NULL) {

@@ -19,11 +19,12 @@ void records_add(Pool *pool, size_t begin, size_t count, Mask mask, const double
 
 /* Whether no step of the episode is missing in the record. */
 bool record_is_whole(const Pool *pool, size_t index);
-/* The bytes of such a record: its start values, and the inputs of each row. Sets how many there are. */
+/* The bytes of such a record: its start values, the texts of Strings, and the inputs of each row. Sets
+ * how many values and rows there are. */
 size_t record_size(const Pool *pool, size_t index, int64_t *starts, int64_t *rows);
 void record_write(const Pool *pool, size_t index, char *to);
 /* Whether so many bytes are a record with so many start values and rows, for a pool that keeps any. */
-bool record_fits(const Pool *pool, int64_t starts, int64_t rows, size_t size);
+bool record_fits(const Pool *pool, int64_t starts, int64_t rows, const char *bytes, size_t size);
 /* Lets the record of an instance be the one in such bytes. */
 void record_put(Pool *pool, size_t index, size_t starts, size_t rows, const char *from);
 

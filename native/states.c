@@ -144,7 +144,8 @@ bool state_is_sound(const Pool *pool, State state) {
     const size_t rest = state.size - before;
     return head.kind == KIND_ENDED    ? rest == 0
            : head.kind == KIND_STATE  ? rest > 0 && serializes(pool)
-           : head.kind == KIND_RECORD ? record_fits(pool, head.starts, head.rows, rest)
+           : head.kind == KIND_RECORD ? record_fits(pool, head.starts, head.rows,
+                                                   state.bytes + before, rest)
                                       : false;
 }
 

@@ -109,7 +109,7 @@ class Variable:
         relative: Whether it is a difference, whose unit is converted without an offset.
         nominal: None where neither the variable nor its declared type gives a finite number.
         items: Names and values of an enumeration. Of a String, the texts that it may get and their
-            numbers; see ``fmugym.archive.texts``.
+            places among these; see ``fmugym.archive.texts``.
         shape: The shape of an array (FMI 3.0); () for a scalar.
         dimensions: Of an array, for each dimension the structural parameter that gives its length;
             "" for a fixed length.
@@ -363,7 +363,7 @@ class Variable:
 def checked_value(variable: Variable, value: Any) -> float:
     """Convert a value for a variable to a number, without loss.
 
-    Of a String, this is the number of one of the texts that the variable knows.
+    Of a String, this is the place of the text among those that the variable knows.
 
     Raises:
         ConfigError: If the value is not finite, not of the variable's kind, or outside its type's
@@ -371,9 +371,9 @@ def checked_value(variable: Variable, value: Any) -> float:
     """
     if isinstance(value, str) and variable.items:
         return _item_value(variable, str.__str__(value))
-    number = check_number(repr(variable.name), value, may_be_boolean=variable.kind == "boolean")
-    if variable.kind == "string" and number not in dict(variable.items).values():
+    if variable.kind == "string":
         raise ConfigError(f"{variable.name!r} is a String, got {shown(value)}")
+    number = check_number(repr(variable.name), value, may_be_boolean=variable.kind == "boolean")
     if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
         raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {number}")
     if variable.kind == "boolean" and number not in {0.0, 1.0}:

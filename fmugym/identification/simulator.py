@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.texts import number_of
-from fmugym.archive.variable import Variable, checked_value
+from fmugym.archive.texts import start_of
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
@@ -94,10 +94,13 @@ class Simulator:
         self._inputs = list(dict.fromkeys([*logged, *offsets]))
         self._offset_rows = [self._inputs.index(name) for name in offsets]
         self._logged = self._logged_inputs(trajectories)
-        constants = [start_variable(fmu.description, name, fixed[name]) for name in fixed]
-        self._variables = *(one for one in free if one.causality != "input"), *constants
-        numbers = [_constant(one, fixed[one.name]) for one in constants]
-        self._constants = np.reshape(numbers, (-1, 1))
+        constants = [
+            start_of(start_variable(fmu.description, name, value), value)
+            for name, value in fixed.items()
+        ]
+        own = (one for one in free if one.causality != "input")
+        self._variables = *own, *(variable for variable, _ in constants)
+        self._constants = np.reshape([number for _, number in constants], (-1, 1))
         inputs, outputs = (tuple(map(fmu.variable, n)) for n in (self._inputs, self.outputs))
         _require_fit(inputs, outputs)
         spec = PoolSpec(inputs, outputs, step)
@@ -242,13 +245,6 @@ def _as_in(given: PoolSpec, spec: PoolSpec) -> PoolSpec:
         warm_up_steps=0,
         records=False,
     )
-
-
-def _constant(variable: Variable, value: float | str) -> float:
-    """The value of a fixed parameter as a number; that of a String stands for its text."""
-    if variable.kind == "string" and isinstance(value, str):
-        return number_of(value)
-    return checked_value(variable, value)
 
 
 def _require_fit(inputs: Sequence[Variable], outputs: Sequence[Variable]) -> None:

@@ -13,8 +13,8 @@ import numpy as np
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU, StandsForFMU
-from fmugym.archive.texts import number_of, with_texts
-from fmugym.archive.variable import Variable, checked_value
+from fmugym.archive.texts import start_of
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
@@ -187,14 +187,7 @@ def _chosen(
 def _start_values(
     description: ModelDescription, values: Mapping[str, Any]
 ) -> dict[Variable, float]:
-    """Check the values; a String gets the number of its text."""
-    checked: dict[Variable, float] = {}
-    for variable, value in start_values(description, values):
-        if isinstance(value, str) and variable.kind == "string":
-            checked[with_texts(variable, [value])] = number_of(value)
-        else:
-            checked[variable] = checked_value(variable, value)
-    return checked
+    return dict(start_of(variable, value) for variable, value in start_values(description, values))
 
 
 def _linear_model(

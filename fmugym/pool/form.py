@@ -22,7 +22,7 @@ import numpy as np
 
 from fmugym.archive.description import Capabilities, ModelDescription, ModelExchange
 from fmugym.archive.fmu import FMU
-from fmugym.archive.texts import number_of
+from fmugym.archive.texts import texts_of
 from fmugym.archive.variable import Variable, unlisted
 from fmugym.pool.spec import (
     DEFAULT_TOLERANCE,
@@ -157,16 +157,10 @@ class Writer:
         both = [*variables, *rest]
         self.block(bytes(type_number(variable, version) for variable in both))
         self.array([(v.value_reference, v.place, v.size) for v in both], np.uint32)
-        return self.array([v.start_number for v in rest], np.float64).block(_texts(variables))
-
-
-def _texts(variables: Sequence[Variable]) -> bytes:
-    """The texts that Strings may get, each with its number before it, by ascending numbers."""
-    texts = {text for v in variables if v.kind == "string" for text, _ in v.items}
-    return b"".join(
-        NUMBER.pack(number_of(text)) + text.encode() + b"\0"
-        for text in sorted(texts, key=number_of)
-    )
+        self.array([v.start_number for v in rest], np.float64)
+        strings = [texts_of(variable) for variable in variables if variable.kind == "string"]
+        self.array([len(texts) for texts in strings], np.uint32)
+        return self.block(b"".join(text.encode() + b"\0" for texts in strings for text in texts))
 
 
 def form_of_listing(variables: Sequence[Variable], version: int = 2, manner: int = 0) -> bytes:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.texts import text_of, with_texts
+from fmugym.archive.texts import with_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.bundle import FloatArray, head_of, outputs_of
@@ -24,11 +24,11 @@ def _variables_of(
     types: Sequence[int],
     references: Sequence[int],
     places: Sequence[int],
-    values: Sequence[float],
+    texts: Iterable[str],
 ) -> tuple[Variable, ...]:
     """Find start variables by C type, value reference and place in an array.
 
-    Aliases are as good. A String knows the text that its value stands for.
+    Aliases are as good. A String knows the text that it got.
     """
     version = table_of(description)
     known = {
@@ -42,14 +42,15 @@ def _variables_of(
         known[type_, reference].elements[place]
         for type_, reference, place in zip(types, references, places, strict=True)
     ]
+    left = [*texts]
     return tuple(
-        with_texts(variable, [text_of(value)]) if variable.kind == "string" else variable
-        for variable, value in zip(found, values, strict=True)
+        with_texts(variable, [left.pop(0)]) if variable.kind == "string" else variable
+        for variable in found
     )
 
 
 _START: Final = np.dtype(
-    [("value", "f8"), *((name, "u4") for name in ("type", "reference", "place", "unused"))]
+    [("value", "f8"), *((name, "u4") for name in ("type", "reference", "place", "size"))]
 )
 """A start value among recorded inputs; ``RecordedStart`` of ``native/pool.h``."""
 
@@ -90,6 +91,9 @@ def _inputs_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> R
     head, (_, content) = head_of(state), outputs_of(state, len(spec.outputs))
     end = head.starts * _START.itemsize
     starts = np.frombuffer(content[:end], _START)
-    parts = (starts[name].tolist() for name in ("type", "reference", "place", "value"))
-    inputs = np.frombuffer(content[end:]).reshape(head.rows, len(spec.inputs))
-    return RecordedInputs(_variables_of(description, *parts), starts["value"], inputs)
+    types, references, places = (starts[n].tolist() for n in ("type", "reference", "place"))
+    after = end + int(starts["size"].sum())
+    texts = content[end:after].decode().split("\0")[:-1]
+    inputs = np.frombuffer(content[after:]).reshape(head.rows, len(spec.inputs))
+    variables = _variables_of(description, types, references, places, texts)
+    return RecordedInputs(variables, starts["value"], inputs)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fmugym.archive.texts import number_of, texts_of
+from fmugym.archive.texts import texts_at, texts_of
 from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
 from fmugym.distributions import Recipe, draw_all, is_distribution, recipe_of, together
@@ -68,10 +68,10 @@ class EpisodeDraws:
     Attributes:
         model_variables: As given.
         constants: The parameters' values, shape (P,); 0 for those that are drawn, and of Strings
-            the number of a text.
+            the places of the texts.
         told: The overridden parameters and their values, which infos report.
-        strings: The parameters that are Strings. Hooks and infos get their texts, and all else the
-            numbers that stand for these; see ``fmugym.archive.texts``.
+        strings: The parameters that are Strings, with the texts that they may get. Hooks and infos
+            get these, and all else their places; see ``fmugym.archive.texts``.
     """
 
     def __init__(
@@ -91,11 +91,11 @@ class EpisodeDraws:
             if is_distribution(value)
         }
         constants = [
-            _constant(variable, None if name in self._random_parameters else value)
+            0.0 if name in self._random_parameters else _number(variable, value)
             for variable, (name, value) in zip(model_variables, parameters.items(), strict=True)
         ]
         self.constants = np.array(constants, np.float64)
-        self.strings = frozenset(v.name for v in model_variables if v.kind == "string")
+        self.strings = {v.name: texts_of(v) for v in model_variables if v.kind == "string"}
         self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
         self._variables.update((name, array.constants) for name, array in self._arrays.items())
         self._random_variables = {
@@ -177,9 +177,8 @@ class EpisodeDraws:
     def shown(self, values: Sequence[Any] | FloatArray) -> dict[str, Any]:
         """The same as ``named``, but Strings are texts, or arrays of them."""
         named = self.named(values)
-        if self.strings:
-            named.update((n, texts_of(named[n])) for n in self.strings & named.keys())
-        return named
+        own = self.strings.keys() & named.keys()
+        return named | {name: texts_at(self.strings[name], named[name]) for name in own}
 
     @cached_property
     def constant_parameters(self) -> dict[str, Any]:
@@ -305,11 +304,9 @@ def is_drawn(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype == object
 
 
-def _constant(variable: Variable, value: Any) -> float:
-    """The number of a parameter; any that is possible if it is drawn, which None stands for."""
-    if variable.kind == "string":
-        return variable.items[0][1] if value is None else number_of(value)
-    return 0.0 if value is None else value
+def _number(variable: Variable, value: Any) -> Any:
+    """A checked value of a parameter as a number."""
+    return checked_value(variable, value) if variable.kind == "string" else value
 
 
 def _is_double(variable: Variable) -> bool:

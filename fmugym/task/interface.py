@@ -94,7 +94,7 @@ class Interface:
         variable = self.resolved.get(name) or self.description.variable(name)
         if variable.kind != "string":
             return variable
-        return with_texts(variable, (*texts_in(variable, value), *self.texts.get(name, ())))
+        return with_texts(variable, (*self.texts.get(name, ()), *texts_in(variable, value)))
 
     @cached_property
     def parameter_variables(self) -> dict[str, Variable]:

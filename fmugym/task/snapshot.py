@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 
@@ -154,8 +153,6 @@ def _unpickled(version: int, *parts: Any) -> Snapshot:
     if hashlib.sha256(content).digest() != digest:
         raise SimulationError("the snapshot is damaged: its pickle has changed")
     scope, columns, bundle = pickle.loads(content)
-    for column in columns["parameters"].values():
-        numbers_of(value for value in column if isinstance(value, str))  # are now known here
     return Snapshot(scope, columns, bundle)
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.archive.texts import texts_of
+from fmugym.archive.texts import Texts, texts_at
 from fmugym.checks import Spellings
 from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_name
 
@@ -152,16 +152,16 @@ class ShownParameters(Mapping[str, Any]):
     """The parameters of N environments as hooks read them: Strings as arrays of texts.
 
     Args:
-        rows: A row of shape (N,) for each parameter; of a String it has the numbers of the texts.
-        strings: The names of the Strings.
+        rows: A row of shape (N,) for each parameter; of a String it has the places of the texts.
+        texts: By name, the texts of the Strings.
     """
 
-    def __init__(self, rows: ParameterValues, strings: frozenset[str]) -> None:
-        self._rows, self._strings = rows, strings
+    def __init__(self, rows: ParameterValues, texts: Mapping[str, Texts]) -> None:
+        self._rows, self._texts = rows, texts
 
     def __getitem__(self, name: str) -> Any:
         row = self._rows[name]
-        return texts_of(row) if name in self._strings else row
+        return texts_at(self._texts[name], row) if name in self._texts else row
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._rows)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.texts import values_by_name
 from fmugym.pool import Pool
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.licences import require_started
@@ -149,12 +150,13 @@ class WarmUps:
         self._keys = {}
         if not self.warm_up.caches or not self._can_keep(beginning.pool):
             return {}
-        names = repr([one.name for one in beginning.draws.model_variables]).encode()
+        variables = beginning.draws.model_variables
         rows = [np.asarray(beginning.row(name)) for name in self.warm_up.depends_on]
         found = {}
         for index in indices:
             own = (np.float64(row[..., index]).tobytes() for row in rows)
-            parts = [names, beginning.episode.start_values[:, index].tobytes(), *own]
+            starts = beginning.episode.start_values[:, index].tolist()
+            parts = [repr(values_by_name(variables, starts)).encode(), *own]
             key = self._key(parts)
             warmed = _memory.find(key) or self._read(key)
             if warmed is None:

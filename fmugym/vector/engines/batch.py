@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import numbers_of
+from fmugym.archive.texts import texts_at
+from fmugym.archive.variable import checked_value
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE
@@ -96,6 +97,7 @@ class BatchEngine(Engine):
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
+        self._strings = env.fmu.description.strings
         self._make_parameters(env.inside.draws)
         self._memory = Memory(env, env.inside.readings, self.ended, self._columns)
         self._prepare(task)
@@ -107,9 +109,13 @@ class BatchEngine(Engine):
             zip(draws.parameter_names, self._start_values, strict=True)
         )
         self._known = set(self._parameters)
-        strings = self.env.fmu.description.strings
-        shown = ShownParameters(self._parameters, strings) if strings else self._parameters
-        self.env.parameters = MappingProxyType(shown)
+        self._texts = {name: self._with_own(texts) for name, texts in draws.strings.items()}
+        shown = ShownParameters(self._parameters, self._texts)
+        self.env.parameters = MappingProxyType(shown if self._strings else self._parameters)
+
+    def _with_own(self, texts: Sequence[str]) -> npt.NDArray[np.object_]:
+        """The texts that a String draws from, and a place for an own one of each environment."""
+        return np.array([*texts, *[None] * self._n], object)
 
     def _prepare(self, task: TracedTask) -> None:
         """Give the pool everything it needs for steps."""
@@ -146,13 +152,14 @@ class BatchEngine(Engine):
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
-        env, before = self.env, self._parameters
-        self._given[name] = numbers_of(values) if values.dtype == object else values
+        env, before = self.env, self.env.parameters
         env.inside.interface = env.inside.interface.with_parameter(name, values, 0)
+        variable = env.inside.interface.parameter_variables[name]
+        self._given[name] = np.array([checked_value(variable, one) for one in values.tolist()])
         env.inside.draws = draws_of(env)
         self._make_parameters(env.inside.draws)
         for known in before.keys() & self._parameters.keys():
-            self._parameters[known][:] = before[known]
+            self._place_parameter(known, before[known], slice(None))
         self._prepare(self._task)
         self._note_foreign(slice(None), True)
 
@@ -345,6 +352,9 @@ class BatchEngine(Engine):
         self._place_episodes(indices, draws, drawn)
         self.has_moved = True
         rows = {name: self._parameters[name] for name in draws.parameter_names}
+        for name, numbers in self._numbers_of_told_texts(draws, drawn).items():
+            rows[name] = np.zeros(self._n)
+            rows[name][indices] = numbers
         values = np.array([*rows.values()]).reshape(len(rows), self._n)
         _Beginning(self, draws, Episode(values, rows, {}, {}), indices).begin()
 
@@ -354,7 +364,28 @@ class BatchEngine(Engine):
         self._place(draws.variable_starts | constants | draws.named(drawn), indices)
         own = constants.keys() - draws.told.keys()
         self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
+        for name, numbers in self._numbers_of_told_texts(draws, drawn).items():
+            self._place_parameter(name, texts_at(draws.strings[name], numbers), indices)
         self._note_foreign(indices, draws is not self.env.inside.draws)
+
+    def _numbers_of_told_texts(self, draws: EpisodeDraws, drawn: FloatArray) -> dict[str, Any]:
+        """What options give to Strings: places among the texts that only these draws know."""
+        told = draws.strings.keys() & draws.told.keys()
+        numbers = draws.constant_parameters | draws.named(drawn) if told else {}
+        return {name: numbers[name] for name in told}
+
+    def _place_parameter(self, name: str, values: Any, indices: IndexArray | slice) -> None:
+        """Write values of a parameter as hooks read them."""
+        row = self._row(name)
+        if name not in self._strings:
+            row[indices] = values
+            return
+        texts, where = self._texts.setdefault(name, self._with_own(())), np.arange(self._n)[indices]
+        count, each = len(texts) - self._n, np.broadcast_to(np.asarray(values, object), where.shape)
+        known = {text: place for place, text in enumerate(texts[:count].tolist())}
+        for index, text in zip(where.tolist(), each, strict=True):
+            texts[count + index] = text
+            row[index] = known.get(text, count + index)
 
     def _place(self, values: Mapping[str, Any], indices: IndexArray | slice) -> None:
         for name, value in values.items():
@@ -388,10 +419,11 @@ class BatchEngine(Engine):
         whence = which_of(sources, len(columns["step_count"]))
         where = which_of(indices, self._n)
         place_columns(self.env, columns, whence, where)
-        strings = self.env.fmu.description.strings
         for name, values in (columns["parameters"] | columns["variables"]).items():
-            column = numbers_of(values) if name in strings else values
-            place_column(self._row(name), column, whence, where)
+            if name in self._strings:
+                self._place_parameter(name, np.array(values, object)[whence], where)
+            else:
+                place_column(self._row(name), values, whence, where)
         if isinstance(columns["streams"], np.ndarray):
             seeds = np.array(columns["seeds"], object)[whence]
             self._streams.put(where, columns["streams"][whence], seeds)
