@@ -131,6 +131,53 @@ def test_each_environment_has_its_own_text(feedthrough, options, hooks, make_env
         envs.set_attr("String_parameter", ["a", "b", 3])
 
 
+@pools
+def test_texts_that_only_one_reset_knows_take_turns(feedthrough, options):
+    """Each is the only one that its reset knows, also where an initial state could be kept."""
+    env = Reading(feedthrough[3], words="abc", **options)
+    for word in ("four", "sixsix", "four", "four", "sixsix", "sixsix", "abc"):
+        given = {} if word == "abc" else {"model_parameters": {"String_parameter": word}}
+        assert env.reset(options=given)[0].tolist() == [len(word)]
+        assert env.parameters["String_parameter"] == word
+        assert env.step(0)[0].tolist() == [len(word)]
+    env.close()
+
+
+@in_turn({"hooks": ["array", "per_env"], "options": POOLS})
+def test_texts_for_one_episode_of_each_environment(feedthrough, options, hooks, make_envs):
+    envs = make_envs(lambda: Telling(feedthrough[3], words="abc", **options), 5, hooks=hooks)
+    idle = np.zeros(5, np.int64)
+
+    def texts():
+        return [one["String_parameter"] for one in envs.get_attr("parameters")]
+
+    def reset(words):
+        for index, word in enumerate(words):
+            given = {"reset_mask": np.arange(5) == index}
+            if word != "abc":
+                given["model_parameters"] = {"String_parameter": word}
+            observations = envs.reset(options=given)[0]
+            assert observations[index].tolist() == [len(word)]
+        assert texts() == words
+
+    envs.reset()
+    words = ["a", "abc", "four", "", "sixsix"]
+    reset(words)
+    observations, rewards, *_ = envs.step(idle)
+    assert observations[:, 0].tolist() == [1, 3, 4, 0, 6]
+    assert rewards.tolist() == [2, 0, 0, 0, 0]
+    saved = envs.save_state()
+    reset(["sixsix", "a", "abc", "abc", "bb"])
+    envs.restore_state(saved)
+    assert texts() == words
+    assert envs.step(idle)[0][:, 0].tolist() == [1, 3, 4, 0, 6]
+    envs.set_attr("String_parameter", ["sixsix", "", "x", "abc", "yy"])
+    assert texts() == words, "until the next reset"
+    assert envs.step(idle)[1].tolist() == [2, 0, 0, 0, 0]
+    assert envs.reset()[0][:, 0].tolist() == [6, 0, 1, 3, 2]
+    assert texts() == ["sixsix", "", "x", "abc", "yy"]
+
+
 def test_another_process_learns_the_text_of_a_snapshot(feedthrough, tmp_path):
     """A text that is not in the config, so that nothing else tells it."""
     with Reading(feedthrough[3]) as env:
