@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from measure import MissingError, Run, Sample, Stopwatch, repeated
 
 import fmugym
-from fmugym.pool import has_native_pool
+from fmugym.pool.extension import require_engine
 
 __all__ = [
     "FMUGYM",
@@ -52,8 +52,10 @@ def require_native_pool() -> None:
     Raises:
         MissingError: If the C extension was not built.
     """
-    if not has_native_pool():
-        raise MissingError("not built")
+    try:
+        require_engine("this benchmark")
+    except fmugym.ConfigError:
+        raise MissingError("not built") from None
 
 
 # One environment

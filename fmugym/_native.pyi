@@ -68,9 +68,6 @@ def statistics() -> dict[str, int]:
 def initializations() -> int:
     """How many initializations the pools of this process have begun."""
 
-def undisturbed(function: Callable[..., Any], /, *arguments: Any) -> Any:
-    """Call a function; handlers of signals that arrive meanwhile run afterwards."""
-
 def serve(channel: int, memory: int, /) -> None:
     """Be a worker until the other end of the channel is closed; see ``native/worker``.
 

@@ -201,7 +201,8 @@ class FMUEnv(Constructed):
         seed, draws = check_seed(seed), draws_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
-        episode = draws.draw(self.np_random if generator is None else generator)
+        rng = self.np_random if generator is None else generator
+        episode = draws.draw(rng, natively=pool.plays_alone)
         inside.ended = True  # there is no episode if the FMU fails
         try:
             BeginningOfOne(self, draws, episode).begin()

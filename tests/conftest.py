@@ -17,6 +17,8 @@ import tiers
 import wine_tools
 
 import fmugym
+from fmugym.errors import ConfigError
+from fmugym.pool.extension import require_engine
 from fmugym.tools.cli import main
 from fmugym.wine.prefix import Wine
 
@@ -36,6 +38,24 @@ def pytest_ignore_collect(collection_path, config):
     """Skip the import of modules that the default run leaves out as a whole."""
     left_out = collection_path.stem in tiers.SLOW_MODULES
     return True if left_out and config.option.markexpr == "not slow" else None
+
+
+class EngineModule(pytest.Module):
+    """A module of tests that need the C extension: it is not imported where that was not built."""
+
+    def collect(self):
+        try:
+            require_engine(self.path.name)
+        except ConfigError as error:
+            pytest.skip(str(error), allow_module_level=True)
+        return super().collect()
+
+
+def pytest_pycollect_makemodule(module_path, parent):
+    """Leave to pytest only the modules that need no C extension."""
+    if module_path.stem in tiers.WITHOUT_EXTENSION:
+        return None
+    return EngineModule.from_parent(parent, path=module_path)
 
 
 def pytest_collection_finish():

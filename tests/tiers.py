@@ -65,9 +65,29 @@ SLOW_MODULES = {
     "test_systems_resets",
     "test_systems_ssp",
     "test_systems_strings",
-    "test_without_native",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
+
+WITHOUT_EXTENSION = {
+    "test_clock_shift",
+    "test_declared_parts",
+    "test_declared_tables",
+    "test_distributions",
+    "test_executable",
+    "test_files",
+    "test_fmu_log",
+    "test_hostile_archive",
+    "test_kept",
+    "test_keys",
+    "test_lenient",
+    "test_model_description",
+    "test_progress_bars",
+    "test_rendering_scenes",
+    "test_temporary",
+    "test_untidy_archives",
+    "test_without_native",
+}
+"""Modules of which every test runs where the C extension was not built, too."""
 
 EVERY = {
     "test_golden_tasks": 4,
@@ -254,6 +274,7 @@ SLOW_TESTS = (
     "test_trial.py::TestSurvival::test_is_remembered",
     "test_trial.py::TestSurvival::test_without_a_place",
     "test_vector_codec.py::test_gathered_as",
+    "test_without_native.py::test_without_the_headers",
 )
 """Others, by the beginning of their node ids."""
 

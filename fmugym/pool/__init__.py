@@ -3,7 +3,6 @@
 from fmugym.pool.backend.backend_pool import Backend, BackendPool
 from fmugym.pool.backend.pacing import Paced
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
-from fmugym.pool.extension import has_native_pool
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
 
 __all__ = [
@@ -17,5 +16,4 @@ __all__ = [
     "Pool",
     "PoolSpec",
     "StatusArray",
-    "has_native_pool",
 ]

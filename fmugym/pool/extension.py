@@ -1,4 +1,4 @@
-"""Whether the C extension exists, and which of its errors mean what."""
+"""Whether the C extension exists, what to install if not, and which of its errors mean what."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from collections.abc import Callable
 from types import CodeType
 from typing import Final, ParamSpec, TypeVar
 
+from fmugym.errors import ConfigError
+
 __all__ = [
-    "HOW_TO_BUILD",
     "has_native_pool",
+    "needs_engine",
     "passes_refusals",
+    "require_engine",
     "require_refusal",
 ]
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-HOW_TO_BUILD = (
-    "the C extension of fmugym was not built, because Python's headers were missing. Install them "
-    "(on Debian: apt install python3-dev), and fmugym again"
-)
 
 
 @functools.cache
@@ -31,6 +29,33 @@ def has_native_pool() -> bool:
     except ImportError:
         return False
     return True
+
+
+def needs_engine(doing: str) -> str:
+    """Say in one line that something takes the C extension, and what to install if it is missing.
+
+    Args:
+        doing: What it is, the subject of the sentence.
+    """
+    if has_native_pool():
+        return f"{doing} needs the C extension (backend='native')"
+    return (
+        f"{doing} needs the C extension of fmugym, which was not built because Python's headers "
+        "were missing. Install them (on Debian: apt install python3-dev), and fmugym again"
+    )
+
+
+def require_engine(doing: str) -> None:
+    """Refuse what only the C extension does where it was not built.
+
+    Args:
+        doing: What it is, as for ``needs_engine``.
+
+    Raises:
+        ConfigError: If there is no C extension.
+    """
+    if not has_native_pool():
+        raise ConfigError(needs_engine(doing))
 
 
 _passed: Final[set[CodeType]] = set()

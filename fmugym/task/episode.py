@@ -212,8 +212,12 @@ class EpisodeDraws:
         """Draw the parameters of some episodes, in their order, shape (P, count)."""
         return np.hstack([self.draw(rng).start_values.copy() for _ in range(count)])
 
-    def draw(self, rng: np.random.Generator) -> Episode:
+    def draw(self, rng: np.random.Generator, *, natively: bool = False) -> Episode:
         """Draw one episode.
+
+        Args:
+            rng: The generator.
+            natively: Whether the C extension steps the FMU, and makes the draws that it can.
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
@@ -221,7 +225,7 @@ class EpisodeDraws:
         parameters, variables = ParameterValues(self._parameters), self._variables.copy()
         drawn: dict[str, Any] = {}
         if self._distributions:
-            drawn = self.shown(self.draw_values(rng))
+            drawn = self.shown(self.draw_values(rng, natively=natively))
             for name in self._random_parameters:
                 parameters[name] = drawn[name]
             for name in self._random_variables:
@@ -229,10 +233,14 @@ class EpisodeDraws:
         told = self.told | drawn
         return Episode(self._start_values, MappingProxyType(parameters), variables, told)
 
-    def draw_values(self, rng: np.random.Generator) -> list[float]:
+    def draw_values(self, rng: np.random.Generator, *, natively: bool = False) -> list[float]:
         """Draw the values of one episode; its parameters become start values.
 
-        Python draws the same numbers where the C extension cannot.
+        The C extension draws the same numbers as Python.
+
+        Args:
+            rng: The generator.
+            natively: Whether the C extension makes the draws that it can.
 
         Returns:
             The drawn values in the order of ``drawn``.
@@ -240,7 +248,8 @@ class EpisodeDraws:
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
-        if self.told or self.native is None:  # options serve for one reset: not worth preparing
+        prepared = natively and not self.told  # options serve for one reset: not worth it
+        if not prepared or self.native is None:
             values = self._drawn_by(rng)
             for index, value in zip(self._random_parameters.values(), values, strict=False):
                 self._starts[index] = value

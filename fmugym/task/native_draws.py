@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fmugym.distributions import Recipe
-from fmugym.pool import has_native_pool
 from fmugym.pool.form import form_of_draws
 
 if TYPE_CHECKING:
@@ -29,9 +28,9 @@ def native_draws(recipes: Sequence[Recipe] | None, rows: Sequence[int]) -> Draws
         rows: For each, the row of the start value that it sets, or -1.
 
     Returns:
-        None if the C extension is not there or cannot make one of the draws.
+        None if the C extension cannot make one of the draws.
     """
-    if recipes is None or not has_native_pool():
+    if recipes is None:
         return None
     needed = {"normal": _standard_normal, "log_uniform": _exponential}
     if any(recipe.kind in needed and not needed[recipe.kind]() for recipe in recipes):

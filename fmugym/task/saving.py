@@ -11,6 +11,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool import Pool
+from fmugym.pool.extension import needs_engine
 from fmugym.task.construction import Constructed
 from fmugym.task.plain import changed, plain_attributes
 from fmugym.task.snapshot import Column, Columns
@@ -40,8 +41,9 @@ def require_saving(pool: Pool) -> None:
         SimulationError: If the pool has no states.
     """
     if pool.save_method is None:
-        what = "a real system" if pool.is_real else "an FMU that FMPy steps"
-        raise SimulationError(f"{what} has no states that could be restored")
+        if pool.is_real:
+            raise SimulationError("a real system has no states that could be restored")
+        raise SimulationError(needs_engine("a saved state"))
 
 
 def columns_of(env: Constructed) -> Columns:

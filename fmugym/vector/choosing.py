@@ -9,7 +9,7 @@ from gymnasium.vector.utils import batch_space
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import Pool
-from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool
+from fmugym.pool.extension import require_engine
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.engines.per_env import PerEnvEngine
@@ -64,10 +64,9 @@ def _make_all(maker: EnvMaker, prototype: FMUEnv, count: int) -> list[FMUEnv]:
 
 
 def _use_arrays(prototype: FMUEnv, hooks: str) -> bool:
-    if hooks == "per_env" or (hooks == "auto" and not has_native_pool()):
+    if hooks == "per_env":
         return False
-    if not has_native_pool():
-        raise ConfigError(f"hooks={hooks!r} is not possible: {HOW_TO_BUILD}")
+    require_engine(f"a vector environment with hooks={hooks!r} instead of 'per_env'")
     difference = find_difference(prototype)
     if difference is None:
         return True

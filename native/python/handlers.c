@@ -167,25 +167,6 @@ bool handlers_release(Held *held) {
     return first.type == NULL;
 }
 
-/* Takes a function and its arguments. */
-PyObject *py_undisturbed(PyObject *module, PyObject *args) {
-    Held held;
-    PyObject *function = PyTuple_GetItem(args, 0);
-    PyObject *rest = function == NULL ? NULL : PyTuple_GetSlice(args, 1, PyTuple_Size(args));
-
-    (void)module;
-    if (rest == NULL || !handlers_hold(&held)) {
-        Py_XDECREF(rest);
-        return NULL;
-    }
-    PyObject *result = PyObject_Call(function, rest, NULL);
-    Py_DECREF(rest);
-    if (!handlers_release(&held)) {
-        Py_CLEAR(result);
-    }
-    return result;
-}
-
 void handlers_hold_at_the_end(Held *held) {
     PyObject *first = NULL;
     bool holds = handlers_hold(held);

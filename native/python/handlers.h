@@ -31,7 +31,4 @@ bool handlers_release(Held *held);
 void handlers_hold_at_the_end(Held *held);
 void handlers_postpone(Held *held);
 
-/* A function of the module */
-PyObject *py_undisturbed(PyObject *module, PyObject *args);
-
 #endif

@@ -56,7 +56,6 @@ static PyMethodDef functions[] = {
     {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
-    {"undisturbed", py_undisturbed, METH_VARARGS, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},
     {"end_with", py_end_with, METH_O, NULL},
     {"stop_tracing", py_stop_tracing, METH_VARARGS, NULL},

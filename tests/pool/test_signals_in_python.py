@@ -22,7 +22,8 @@ import pool_tools
 import pytest
 
 import fmugym
-from fmugym import FMU, _native
+from fmugym import FMU
+from fmugym.pool.backend.signals import signals_held
 from fmugym.vector import FMUVectorEnv
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -168,9 +169,14 @@ class TestAtOnce:
             collections.deque(calls, 0)
             time.sleep(1)
 
-    def test_a_function(self):
-        _native.undisturbed(len, ())
-        self.interrupted(functools.partial(_native.undisturbed, len, ()))
+    def test_what_fmpy_calls(self):
+        def call():
+            with signals_held():
+                pass
+
+        call()
+        self.interrupted(call)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
     def test_the_end_of_a_snapshot(self, fmu):
         pool = pool_tools.open_pool(FMU(fmu), ("u",), ("y",), n=2)

@@ -14,13 +14,13 @@ import gymnasium, fmugym, numpy
 env = gymnasium.make("fmugym/CartPole-v0")
 env.reset(seed=1)
 single = [env.step(1)[0].tolist() for _ in range(5)]
-envs = gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2)
+envs = gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2, hooks="per_env")
 envs.reset(seed=1)
-vector = [envs.step(numpy.array([1, 1]))[0][0].tolist() for _ in range(5)]
-assert single == vector
+assert single == [envs.step(numpy.array([1, 1]))[0][0].tolist() for _ in range(5)]
 for refused in (
     lambda: gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2, backend="native"),
     lambda: gymnasium.make("fmugym/CartPole-v0", isolation="process"),
+    lambda: gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2),
     env.unwrapped.save_state,
 ):
     try:
@@ -35,8 +35,25 @@ def test_the_slow_path_works_and_says_so_once():
     assert result.stdout.count("FMUs are stepped by FMPy, which is slow") == 1
     assert "Python's headers were missing. Install them" in result.stdout
     refusals = [line for line in result.stdout.splitlines() if line.startswith("refused: ")]
-    assert len(refusals) == 3
-    assert all("C extension" in line for line in refusals)
+    assert len(refusals) == 4
+    assert all("python3-dev" in line for line in refusals)
+
+
+TRAINING = f"""
+import sys
+sys.modules["fmugym._native"] = None
+sys.path.insert(0, {str(ROOT / "examples")!r})
+import multiprocessing, train_cart_pole
+train_cart_pole.start_worker(multiprocessing.Value("i"))
+for method in train_cart_pole.AGENTS:
+    task = train_cart_pole.Task(method, 0, 100, 1, train_cart_pole.ENV_ID, {{}})
+    print(train_cart_pole.train_and_evaluate(task).lengths.sum())
+"""
+
+
+def test_the_training_of_the_readme():
+    steps = run_python("-c", TRAINING, check=True).stdout.split()
+    assert [int(number) >= 100 for number in steps] == [True, True]
 
 
 def test_without_the_headers_of_python_a_wheel_is_built(tmp_path):

@@ -7,11 +7,11 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU, copy_libraries
 from fmugym.checks import check_option
-from fmugym.errors import ConfigError, FMULoadError, warn_once
+from fmugym.errors import ConfigError, warn_once
 from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.by_fmpy import FMPyInstance
 from fmugym.pool.base import Pool
-from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool
+from fmugym.pool.extension import has_native_pool, needs_engine, require_engine
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.wishes import Wishes
@@ -36,8 +36,8 @@ def pool_of_backend(
         wishes: Name the backend.
 
     Raises:
-        ConfigError: If the backend is unknown, or cannot do what the spec says.
-        FMULoadError: If the backend is not available, or the FMU cannot be loaded.
+        ConfigError: If the backend is unknown, not available, or cannot do what the spec says.
+        FMULoadError: If the FMU cannot be loaded.
     """
     if isinstance(wishes.backend, str):
         if not _steps_by_fmpy(wishes.backend):
@@ -50,12 +50,15 @@ def pool_of_backend(
 
 def _steps_by_fmpy(backend: str) -> bool:
     check_option("backend", backend, _NAMES)
-    if backend == "native" and not has_native_pool():
-        raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
-    if backend in ("auto", "fmu") and not has_native_pool():
-        warn_once(logger, f"FMUs are stepped by FMPy, which is slow: {HOW_TO_BUILD}")
+    if backend == "fmpy":
         return True
-    return backend == "fmpy"
+    if backend == "native":
+        require_engine("backend='native'")
+    elif not has_native_pool():
+        text = "FMUs are stepped by FMPy, which is slow"
+        warn_once(logger, f"{text}: {needs_engine('speed')}")
+        return True
+    return False
 
 
 @licence_errors()
@@ -70,7 +73,7 @@ def _fmpy_pool(
     if refused:
         raise ConfigError(
             "FMPy steps FMUs for co-simulation with scalar variables here. "
-            f"{fmu.path.name} needs the C extension (backend='native') for: {', '.join(refused)}"
+            + needs_engine(f"{fmu.path.name} ({', '.join(refused)})")
         )
 
     def instances(count: int) -> list[FMPyInstance]:

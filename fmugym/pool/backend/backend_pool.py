@@ -25,6 +25,7 @@ from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray
+from fmugym.pool.extension import needs_engine
 from fmugym.pool.health import Column, CountedPool, new_arrays, note
 from fmugym.pool.spec import is_start_time
 
@@ -225,7 +226,7 @@ class BackendPool(CountedPool):
         """Refuse: a real system cannot return to a state."""
         if self._is_real:
             raise SimulationError("a backend has no states that could be saved")
-        raise SimulationError("states are saved by the C extension only (backend='native')")
+        raise SimulationError(needs_engine("a saved state"))
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""

@@ -21,7 +21,7 @@ from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status, failed_call, sane
 from fmugym.pool.backend.messages import Messages, fmi1_callbacks, fmi2_callbacks
 from fmugym.pool.backend.rig import FaultError
-from fmugym.pool.extension import has_native_pool
+from fmugym.pool.backend.signals import signals_held
 from fmugym.pool.spec import START_TIME, PoolSpec
 
 __all__ = ["FMPyInstance"]
@@ -47,12 +47,8 @@ def _undisturbed(method: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(method)
     def call(*arguments: P.args, **named: P.kwargs) -> R:
         me: Any = arguments[0]
-        if not me.calls_python:
+        with signals_held() if me.calls_python else contextlib.nullcontext():
             return method(*arguments, **named)
-        from fmugym import _native
-
-        result: R = _native.undisturbed(method, *arguments)
-        return result
 
     return call
 
@@ -74,7 +70,7 @@ class FMPyInstance:
 
     def __init__(self, fmu: FMU, spec: PoolSpec, log: logging.Logger, library: Path) -> None:
         self._fmu, self._spec, self._library = fmu, spec, library
-        self.calls_python = has_native_pool() and fmu.calls_python()
+        self.calls_python = fmu.calls_python()
         self._version = fmu.description.fmi_major_version
         self._messages = Messages(fmu.description.model_identifier, log)
         self._slave: Any = None

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.extension import has_native_pool
+from fmugym.pool.extension import require_engine
 from fmugym.pool.form import form_of_program
 
 __all__ = [
@@ -90,10 +90,14 @@ def require_same_table(native: Any) -> None:
         )
 
 
-if has_native_pool():
+@functools.cache
+def _engine() -> Any:
+    """The C extension, which must have been built from the same sources as this module."""
+    require_engine("a program")
     from fmugym import _native
 
     require_same_table(_native)
+    return _native
 
 
 class UntraceableError(Exception):
@@ -227,6 +231,7 @@ def evaluate(
         The results: done, truncated and reward, or nothing; each of shape (M,).
 
     Raises:
+        ConfigError: If there is no C extension.
         IndexError: If an index is outside of its table.
     """
     count = len(actions[0])
@@ -235,6 +240,6 @@ def evaluate(
     first, second = (np.ascontiguousarray(part).reshape(-1) for part in actions)
     elements = first.size // count
     parts = program.with_rows(find)
-    if _native.evaluate(parts, count, elements, first, second, results, seen):
+    if _engine().evaluate(parts, count, elements, first, second, results, seen):
         raise IndexError("a hook looks up an index outside of its table")
     return list(results)
