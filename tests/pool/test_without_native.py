@@ -31,7 +31,7 @@ for refused in (
 
 
 def test_the_slow_path_works_and_says_so_once():
-    result = run_python("-c", PROGRAM, check=True)
+    result = run_python("-c", PROGRAM, check=True, timeout=600)
     assert result.stdout.count("FMUs are stepped by FMPy, which is slow") == 1
     assert "Python's headers were missing. Install them" in result.stdout
     refusals = [line for line in result.stdout.splitlines() if line.startswith("refused: ")]
@@ -52,7 +52,7 @@ for method in train_cart_pole.AGENTS:
 
 
 def test_the_training_of_the_readme():
-    steps = run_python("-c", TRAINING, check=True).stdout.split()
+    steps = run_python("-c", TRAINING, check=True, timeout=600).stdout.split()
     assert [int(number) >= 100 for number in steps] == [True, True]
 
 
