@@ -168,7 +168,7 @@ class Variable:
     ) -> Variable:
         """Make a variable that has these attributes, and all others of this one.
 
-        ``replace`` takes ten times as long, which counts where there are 50,000 variables.
+        ``replace`` takes several times as long, which counts where there are 50,000 variables.
         """
         other = object.__new__(Variable)
         other.__dict__.update(
