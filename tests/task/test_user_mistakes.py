@@ -369,7 +369,7 @@ class TestOrder:
         env.reset()
         with pytest.raises(ConfigError, match="'sume'; did you mean 'sum'"):
             env.read_variables("sume")
-        with pytest.raises(SimulationError, match="label"):  # which the FMU refuses
+        with pytest.raises(ConfigError, match="'label' cannot be read in episodes"):  # a String
             env.read_variables("label")
 
     def test_render_before_reset(self):
