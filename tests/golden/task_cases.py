@@ -394,7 +394,8 @@ def training(name, rounds, folder):
     agent = trained(name, folder, rounds)
     facts = json.loads((agent / "agent.json").read_text(encoding="utf-8"))
     policy = json.loads((agent / "policy.json").read_text(encoding="utf-8"))
-    yield {"scene": "found", "steps": facts["steps"], "weights": plain(policy["weights"])}
+    weights = np.round(policy["weights"], 6)  # processors round the last digits in their own ways
+    yield {"scene": "found", "steps": facts["steps"], "weights": plain(weights)}
     for who, scores in facts["test"].items():
         rewards = {place: plain(values) for place, values in scores["rewards"].items()}
         yield {"scene": who, "rewards": rewards, "costs": plain(scores["mean_costs"])}

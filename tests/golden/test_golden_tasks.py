@@ -32,9 +32,7 @@ def test_every_result_has_its_case():
 
 @pytest.mark.parametrize("name", [name for name in RESULTS if not name.startswith(ONNX)])
 def test_is_as_it_was(name, folder):
-    """Trainings with a tolerance: their linear algebra rounds as the processor likes."""
-    compare = records.rough_difference if name.startswith("training ") else records.difference
-    found = compare(RESULTS[name], list(CASES[name](folder)))
+    found = records.difference(RESULTS[name], list(CASES[name](folder)))
     assert found is None, f"{name}: {found}"
 
 
