@@ -276,6 +276,8 @@ def _variables(pairs: Iterable[tuple[Any, Any]]) -> list[Variable]:
     templates: dict[Any, Variable] = {}
     variables = []
     for source, element in pairs:
+        if source.type.startswith("UInt"):  # of which FMPy leaves out the limits
+            source.min, source.max = element.get("min"), element.get("max")
         key = _what_is_shared(source, element)
         template = templates.get(key)
         if template is None:
@@ -287,8 +289,6 @@ def _variables(pairs: Iterable[tuple[Any, Any]]) -> list[Variable]:
 
 def _what_is_shared(source: Any, element: Any) -> tuple[Any, ...]:
     """All that ``_template`` reads, but for arrays and clocks, which have a template each."""
-    if source.type.startswith("UInt"):  # of which FMPy leaves out the limits
-        source.min, source.max = element.get("min"), element.get("max")
     return (
         _SHARED(source),
         _initial(source),
