@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import fmugym
 from fmugym import Uniform
+from fmugym.linearization import linearize_along
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 
@@ -46,6 +47,29 @@ def require_equal(first, second, rtol=0.0):
         np.testing.assert_allclose(first, second, rtol=rtol, atol=0)
     else:
         np.testing.assert_array_equal(first, second)
+
+
+def methods(envs, snapshot):
+    """Calls of the methods that need an open environment and no step that goes on, by their names.
+
+    ``envs`` are three cart-poles, and ``snapshot`` is of them.
+    """
+    actions = np.zeros(3, np.int64)
+    return {
+        "reset": envs.reset,
+        "step": lambda: envs.step(actions),
+        "step_around": lambda: envs.step_around(actions, np.array([True, False, False])),
+        "step_async": lambda: envs.step_async(actions),
+        "render": envs.render,
+        "save_state": envs.save_state,
+        "restore_state": lambda: envs.restore_state(snapshot),
+        "rollout": lambda: envs.rollout(snapshot, np.zeros((3, 2), np.int64)),
+        "get_attr": lambda: envs.get_attr("state"),
+        "set_attr": lambda: envs.set_attr("force_mag", 10.0),
+        "call": lambda: envs.call("_get_info"),
+        "health": lambda: envs.health,
+        "linearize_along": lambda: linearize_along(envs, snapshot[0], []),
+    }
 
 
 def require_same_infos(first, second):
