@@ -170,18 +170,17 @@ def _time(what: str, value: Any) -> float:
 
 def _moment(what: str, value: Any) -> float:
     """Seconds since the beginning of a year of 365 days, of a duration or of a date."""
-    given = value
     if isinstance(value, datetime.date):  # TOML has dates of its own
         return _moment_of(what, value)
-    match = _DATE.fullmatch(value) if isinstance(value, str) else None
-    if match is None and not _LIKE_A_DATE.match(str(value)):
+    if not isinstance(value, str) or not _LIKE_A_DATE.match(value):
         return _time(what, value)
+    match = _DATE.fullmatch(value)
     month, day, hour, minute = map(int, match.groups(default="0")) if match else (0, 0, 0, 0)
     try:
         date = datetime.datetime(_ANY_YEAR, month, day, hour, minute)
     except ValueError:
         raise ConfigError(
-            f"expected a date such as '01-15' or '01-15 06:00', got {shown(given)}"
+            f"expected a date such as '01-15' or '01-15 06:00', got {shown(value)}"
         ) from None
     return (date - datetime.datetime(_ANY_YEAR, 1, 1)).total_seconds()
 

@@ -119,6 +119,22 @@ def test_a_dict_that_holds_itself_is_refused():
         fmugym.load(own)
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"start_time": 10**5000},
+        {"time_step": 10**5000},
+        {"clock": {"from": 10**5000, "to": "04-15"}},
+        {"reward": 10**5000},
+        {"variables": {"tau": {"min": -(10**5000), "max": 1}}},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_an_integer_of_thousands_of_digits_is_refused_in_a_dict_too(changes):
+    with pytest.raises(TaskError, match=next(iter(changes))):
+        fmugym.load(task(**changes))
+
+
 def test_thousands_of_expressions_may_read_each_other():
     count = 1500
     chain = {f"e{n}": f"e{n - 1} + 1" for n in range(1, count)}
