@@ -28,8 +28,8 @@ from measure import Effort, MissingError, Run, by_turns, make_runs, repeated
 from tables import Table, duration, times
 
 import fmugym
+from fmugym.expressions.program import OPERATIONS, is_function
 from fmugym.task.interface import resolve
-from fmugym.vector.hooks.program import OPERATIONS, is_function
 
 __all__ = ["TASKS", "Task", "fmugym_run", "per_env_runs", "tables"]
 

@@ -29,6 +29,7 @@ from typing import Final
 __all__ = [
     "ArgumentError",
     "ConfigError",
+    "ConsequenceError",
     "ContractError",
     "FMUGymError",
     "FMULoadError",
@@ -119,6 +120,10 @@ class TaskError(ConfigError):
 
     def __str__(self) -> str:
         return "\n".join(map(printable, str(self.args[0]).split("\n")))
+
+
+class ConsequenceError(TaskError):
+    """A value cannot be had because of a mistake that is noted already."""
 
 
 class FMULoadError(FMUGymError):

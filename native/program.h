@@ -15,7 +15,7 @@ enum {
     PROGRAM_RESULTS = 3      /* maximum number of results */
 };
 
-/* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
+/* OPERATIONS in fmugym/expressions/program.py lists their names in the same order. Importing
  * that module compares the two. The letters are those of numpy's types: d float64, f float32,
  * q int64. Booleans are bytes, 0 or 1. Those that move values come first; arithmetic is from ADD_D
  * to WHERE_1; what takes longer is from SIN on, and has one operand until CBRT. */
@@ -105,7 +105,7 @@ typedef enum { EACH_OPERATION(NUMBER_IT) NUMBER_OF_OPERATIONS } Operation;
 
 extern const char *const operation_names[NUMBER_OF_OPERATIONS];
 
-/* TYPES in fmugym/vector/hooks/program.py lists them in the same order: d, f, q, Booleans, and the
+/* TYPES in fmugym/expressions/program.py lists them in the same order: d, f, q, Booleans, and the
  * bytes of actions that are switches. A cast's extra is from * VALUE_TYPES + to. */
 enum { VALUE_DOUBLE, VALUE_FLOAT, VALUE_INTEGER, VALUE_FLAG, VALUE_BYTE, VALUE_TYPES };
 

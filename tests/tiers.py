@@ -1,8 +1,8 @@
 """Three tiers of tests: the default run, ``slow`` tests, and ``exhaustive`` ones among these.
 
-The default run takes at most 90 s on two cores. ``.ci/run`` also runs the slow tests that are not
-exhaustive, and ``.ci/full`` runs every test, as ``python -m pytest -m ""`` does. Every feature is
-in the default run: of a test with many combinations of parameters, it takes every n-th.
+The default run takes some three minutes on two cores. ``.ci/run`` also runs the slow tests that are
+not exhaustive, and ``.ci/full`` runs every test, as ``python -m pytest -m ""`` does. Every feature
+is in the default run: of a test with many combinations of parameters, it takes every n-th.
 """
 
 SLOW_MODULES = {
@@ -165,10 +165,7 @@ SLOW_TESTS = (
     "test_plant.py::TestData::test_has_a_past",
     "test_plant.py::TestData::test_is_what",
     "test_proposal.py::test_bundled",
-    "test_proposal.py::test_foreign",
     "test_proposal.py::test_types",
-    "test_baselines_mpc.py::TestCommandLine::test_training",
-    "test_baselines_mpc.py::TestCommandLine::test_thinking_ahead",
     "test_baselines_mpc.py::TestCosts",
     "test_baselines_mpc.py::TestFuture::test_is_known",
     "test_baselines_mpc.py::TestModel::test_is_corrected",
@@ -231,7 +228,6 @@ SLOW_TESTS = (
     "test_isolated_single.py::test_interrupts",
     "test_isolated_single.py::test_results",
     "test_native_guards.py::test_want_of_memory",
-    "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
     "test_native_threads.py::test_stress",
     "test_neighbours.py::TestOneInitializationAtATime::test_is_told",

@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from fmugym.declared.computed import Value, function_of
-from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.parts import Term
+from fmugym.expressions.by_numpy import function_of
+from fmugym.expressions.language import CONSTANTS, Expression
+from fmugym.expressions.value import Value
 
 __all__ = ["explanation"]
 

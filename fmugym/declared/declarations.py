@@ -17,11 +17,9 @@ from fmugym.archive.units import IDENTITY
 from fmugym.checks import normal_form
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_levels
-from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
 from fmugym.declared.kpis import read_kpi
-from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.declared.parts import (
     Limits,
     Term,
@@ -36,6 +34,8 @@ from fmugym.declared.standard_time import standard_time
 from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, start_value
 from fmugym.declared.warming import read_warm_up
 from fmugym.errors import ConfigError
+from fmugym.expressions.language import CONSTANTS, Expression
+from fmugym.expressions.mathematics import FUNCTIONS
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
 

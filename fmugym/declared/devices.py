@@ -8,12 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.declared.computed import Value, where
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
-from fmugym.declared.mathematics import chance, clip, noise
 from fmugym.distributions import Normal, is_distribution
-from fmugym.vector.hooks.graph import Graph
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.mathematics import chance, clip, noise
+from fmugym.expressions.value import Value, where
 
 __all__ = ["IDEAL", "NOISE", "Device", "chance_in", "first_step", "noise_in", "read_device"]
 
@@ -109,12 +109,14 @@ IDEAL: Final = Device()
 
 def noise_in(count: Value, channel: int) -> Value:
     """A number of the standard normal distribution for each step; see ``mathematics.noise``."""
-    return Value.read(count.graph, "variables", NOISE).called(noise, count, channel)
+    value: Value = noise(Value.read(count.graph, "variables", NOISE), count, channel)
+    return value
 
 
 def chance_in(count: Value, channel: int) -> Value:
     """A number from 0 to 1 for each step, all as likely; see ``mathematics.noise``."""
-    return Value.read(count.graph, "variables", NOISE).called(chance, count, channel)
+    value: Value = chance(Value.read(count.graph, "variables", NOISE), count, channel)
+    return value
 
 
 def first_step(graph: Graph) -> Value:

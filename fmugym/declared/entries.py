@@ -11,8 +11,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from fmugym.declared.mistakes import ConsequenceError, Mistakes
-from fmugym.errors import ConfigError, TaskError, printable
+from fmugym.declared.mistakes import Mistakes
+from fmugym.errors import ConfigError, ConsequenceError, TaskError, printable
 
 __all__ = ["Entry", "Source"]
 

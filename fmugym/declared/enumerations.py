@@ -11,10 +11,10 @@ from fmugym.distributions import Choice
 
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
-    from fmugym.declared.computed import Value
     from fmugym.declared.entries import Entry
     from fmugym.declared.parts import Memory
     from fmugym.declared.variables import TaskVariable
+    from fmugym.expressions.value import Value
 
 __all__ = ["check_controller", "check_levels", "check_written"]
 
@@ -89,6 +89,8 @@ def _known(value: Value, memory: Mapping[str, Memory]) -> Iterator[float]:
                 yield float(node.number)
             case "where", _:
                 waiting += node.operands[1:]
+            case "cast", _:
+                waiting += node.operands
             case "take", table:
                 yield from graph.tables[table].tolist()
             case "interpolate", table:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fmugym.declared.computed import Value, where
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression
 from fmugym.declared.format import KPI
-from fmugym.declared.mathematics import maximum, minimum
+from fmugym.expressions.language import Expression
+from fmugym.expressions.mathematics import maximum, minimum
+from fmugym.expressions.value import Value, where
 
 __all__ = ["Kpi", "kpi_name", "read_kpi"]
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from fmugym.checks import Spellings
-from fmugym.declared.computed import Value, function_of
-from fmugym.declared.expressions import Expression, Names
-from fmugym.vector.hooks.graph import Graph
+from fmugym.expressions.by_numpy import function_of
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.language import Expression, Names
+from fmugym.expressions.value import Value
 
 __all__ = ["signal_of"]
 

@@ -6,16 +6,12 @@ from typing import Final
 
 from fmugym.errors import TaskError
 
-__all__ = ["ConsequenceError", "Mistakes"]
+__all__ = ["Mistakes"]
 
 Keys = tuple[str, ...]
 
 _MOST: Final = 100
 """Mistakes that one error tells, at most."""
-
-
-class ConsequenceError(TaskError):
-    """A value cannot be had because of a mistake that is noted already."""
 
 
 class Mistakes:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from fmugym.declared.computed import Value
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.naming import Moment, Naming
 from fmugym.errors import ConfigError
+from fmugym.expressions.value import Value
 from fmugym.task.quantity import Quantity
 
 __all__ = ["named_values"]

@@ -12,18 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.declared.computed import Value, where
 from fmugym.declared.declarations import BUILT_IN, Declarations
 from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression, Names
-from fmugym.declared.mathematics import clip, maximum
-from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.quantities import nearest_steps, steps_in
 from fmugym.declared.variables import TaskVariable
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError, ConsequenceError, unknown_name
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.language import Expression, Names
+from fmugym.expressions.mathematics import clip, maximum
+from fmugym.expressions.value import Value, where
 from fmugym.task.future import Lookup
-from fmugym.vector.hooks.graph import Graph
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.declared.computed import Value, function_of, where
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
@@ -18,6 +17,7 @@ from fmugym.declared.naming import Moment, Naming, queue_name
 from fmugym.declared.parts import Limits
 from fmugym.declared.quantities import nearest_steps, steps_in
 from fmugym.declared.variables import TaskVariable
+from fmugym.expressions.value import Value, where
 
 __all__ = [
     "History",
@@ -27,7 +27,7 @@ __all__ = [
     "histories",
     "normalized",
     "observed_values",
-    "remember",
+    "remembered",
     "scaled",
 ]
 
@@ -359,21 +359,11 @@ def scaled(seen: Seen) -> Seen:
     return seen._replace(value=(seen.value - middle) / half, limits=(-1.0, 1.0))
 
 
-def remember(kept: list[History], first_step: int) -> Callable[[Any], None]:
-    """Make a function of the environment that adds the latest values to histories.
-
-    Args:
-        kept: The histories.
-        first_step: The step count after the first step; negative if there is a warm-up.
-    """
-    names = [history.variable for history in kept]
-    values = function_of([history.now for history in kept])
-    fills = function_of([history.fill for history in kept])
-
-    def update(env: Any) -> None:
-        is_first, variables = env.step_count == first_step, env.variables
-        for name, value, fill in zip(names, values(env), fills(env), strict=True):
-            before = np.where(is_first, np.asarray(fill)[np.newaxis], variables[name])
-            variables[name] = np.concatenate([np.asarray(value)[np.newaxis], before[:-1]])
-
-    return update
+def remembered(naming: Naming, kept: list[History]) -> dict[str, list[Value]]:
+    """The new values of histories: the latest one is added, the oldest one goes."""
+    is_first = naming.step_count == naming.first_step
+    values: dict[str, list[Value]] = {}
+    for one in kept:
+        older = (naming.read("variables", one.variable, place) for place in range(one.length - 1))
+        values[one.variable] = [one.now, *(where(is_first, one.fill, before) for before in older)]
+    return values

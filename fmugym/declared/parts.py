@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression
+from fmugym.expressions.language import Expression
 
 __all__ = [
     "Derived",

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.declared.computed import Value, function_of
 from fmugym.declared.declarations import Declarations
-from fmugym.declared.expressions import Expression
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.variables import TaskVariable
 from fmugym.declared.warming import signals_of
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
+from fmugym.expressions.by_numpy import function_of
+from fmugym.expressions.graph import Graph, Node
+from fmugym.expressions.language import Expression
+from fmugym.expressions.value import Value
 from fmugym.task.warm_up import WarmUp
-from fmugym.vector.hooks.graph import Graph, Node
 
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
@@ -121,7 +122,7 @@ class DeclaredWarmUp(WarmUp):
     Args:
         naming: Gives names their values.
         inputs: The FMU's inputs.
-        updates: Functions that write episode variables when the FMU has stepped.
+        update: Writes episode variables when the FMU has stepped.
         written: These variables by name, and what is written.
         config: The config.
 
@@ -133,14 +134,14 @@ class DeclaredWarmUp(WarmUp):
         self,
         naming: Naming,
         inputs: Sequence[Value],
-        updates: Sequence[Hook],
+        update: Hook,
         written: Mapping[str, Sequence[Value]],
         config: Mapping[str, Any],
     ) -> None:
         declared, table = naming.declared, naming.declared.warm_up
         self.steps, self._time_step = naming.warm_steps, naming.time_step
         self.caches = table.caches
-        self._inputs, self._updates = function_of(tuple(inputs)), updates
+        self._inputs, self._update = function_of(tuple(inputs)), update
         self.writes = tuple(written)
         self._pilots = [
             Pilot(naming, variable, table.controllers[variable.alias])
@@ -176,8 +177,7 @@ class DeclaredWarmUp(WarmUp):
 
     def update(self, env: Any) -> None:
         """See ``WarmUp.update``."""
-        for update in self._updates:
-            update(env)
+        self._update(env)
 
     def _require_few_states(self, declared: Declarations, config: Mapping[str, Any]) -> None:
         """Refuse to keep states that hardly any later episode could use."""

@@ -8,10 +8,9 @@ from typing import Any
 
 from fmugym.checks import check_mapping, check_number, number_of
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import CONSTANTS, Expression
-from fmugym.declared.mistakes import ConsequenceError
 from fmugym.distributions import as_distribution, is_distribution
-from fmugym.errors import ConfigError, nearest_name, shown
+from fmugym.errors import ConfigError, ConsequenceError, nearest_name, shown
+from fmugym.expressions.language import CONSTANTS, Expression
 from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = ["constant_of", "finite", "nearest_steps", "number", "number_or_distribution", "steps_in"]

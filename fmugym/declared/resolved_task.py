@@ -13,7 +13,6 @@ from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
 from fmugym.declared.blaming import explanation
-from fmugym.declared.computed import Computed, Value, function_of, where
 from fmugym.declared.configuring import (
     bounds_of,
     clock_of,
@@ -25,9 +24,7 @@ from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_written
-from fmugym.declared.expressions import Expression
 from fmugym.declared.kpis import Kpi, kpi_name
-from fmugym.declared.mathematics import minimum
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
 from fmugym.declared.observing import (
@@ -37,7 +34,7 @@ from fmugym.declared.observing import (
     histories,
     normalized,
     observed_values,
-    remember,
+    remembered,
     scaled,
 )
 from fmugym.declared.parts import Term
@@ -48,6 +45,11 @@ from fmugym.declared.task import Task
 from fmugym.declared.variables import TaskVariable, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
+from fmugym.expressions.by_numpy import function_of, update_by
+from fmugym.expressions.formulas import Formulas, Update
+from fmugym.expressions.language import Expression
+from fmugym.expressions.mathematics import minimum
+from fmugym.expressions.value import Computed, Value, where
 from fmugym.task.future import Future
 from fmugym.task.quantity import Quantities
 
@@ -73,7 +75,9 @@ class ResolvedTask:
 
     Attributes:
         config: The config for ``FMUEnv``.
-        hooks: Functions of the environment by the names of the hooks that they are.
+        formulas: What the task computes.
+        hooks: Functions of the environment by the names of the hooks that they are; most of them
+            evaluate formulas.
         observation_names: The names of the elements of the observation.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if the actions have no levels.
@@ -117,6 +121,7 @@ class ResolvedTask:
         """Make what the attributes are."""
         declared = self._declared
         self.config = self._make_config()
+        self.formulas = self._make_formulas()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
         self.warm_up = self._make_warm_up() if self._naming.warm_steps else None
@@ -192,7 +197,7 @@ class ResolvedTask:
         return DeclaredWarmUp(
             self._naming,
             self._input_values(self._declared.warm_up.controllers),
-            [*self._updates_of_histories(), *_assignments(self._switched())],
+            update_by([*self._updates_of_histories(), self._switched()]),
             written,
             self.config,
         )
@@ -266,14 +271,14 @@ class ResolvedTask:
 
     def _hooks_of_spaces(self) -> dict[str, Hook]:
         hooks: dict[str, Hook] = {}
-        actions, seen = self._action_space(), self._observation_space()
-        if actions is not None:
+        actions, seen, formulas = self._action_space(), self._observation_space(), self.formulas
+        if formulas.inputs is not None:
+            values = formulas.inputs
             hooks["_get_action_space"] = lambda env: actions
-            values = self._input_values()
             hooks["_get_inputs"] = function_of(values[0] if len(values) == 1 else values)
-        if seen is not None:
+        if formulas.observation is not None:
             hooks["_get_observation_space"] = lambda env: seen
-            observe = function_of([one.value for one in self._normalized])
+            observe = function_of(formulas.observation)
             hooks["_get_observation"] = lambda env: np.array(observe(env), dtype=np.float32)
         return hooks
 
@@ -362,34 +367,46 @@ class ResolvedTask:
 
     # What follows a step.
 
-    def _hooks_of_steps(self) -> dict[str, Hook]:
-        declared, hooks = self._declared, {}
-        updates = [
-            *_assignments(self._updated_memory()),
+    def _make_formulas(self) -> Formulas:
+        declared = self._declared
+        has_info = declared.costs or declared.has_reward_terms or declared.kpis
+        updates: list[Update] = [
+            self._updated_memory(),
             *self._updates_of_histories(),
-            *_assignments(self._switched()),
-            *_assignments(self._worst),
-            *_assignments(self._updated_kpis),
+            self._switched(),
+            self._worst,
+            self._updated_kpis,
         ]
-        if updates:
-            hooks["_update"] = _in_turn(updates)
-        if "terminated" in declared.flags:
-            hooks["_is_done"] = self._condition("terminated")
-        if "truncated" in declared.flags:
-            hooks["_is_truncated"] = self._condition("truncated")
-        if declared.rewards:
-            terms = self._terms(declared.rewards)
-            hooks["_reward_policy"] = function_of(_sum(terms))
-            hooks["_explain"] = explanation(declared.rewards, terms, self._naming)
+        return Formulas(
+            None if self._action_space() is None else self._input_values(),
+            [update for update in updates if update],
+            self._condition("terminated") if "terminated" in declared.flags else None,
+            self._condition("truncated") if "truncated" in declared.flags else None,
+            _sum(self._terms(declared.rewards)) if declared.rewards else None,
+            None if self._observation_space() is None else [one.value for one in self._normalized],
+            self._info() if has_info else {},
+        )
+
+    def _hooks_of_steps(self) -> dict[str, Hook]:
+        formulas, rewards = self.formulas, self._declared.rewards
+        hooks: dict[str, Hook] = {}
+        if formulas.updates:
+            hooks["_update"] = update_by(formulas.updates)
+        if formulas.terminated is not None:
+            hooks["_is_done"] = function_of(formulas.terminated)
+        if formulas.truncated is not None:
+            hooks["_is_truncated"] = function_of(formulas.truncated)
+        if formulas.reward is not None:
+            hooks["_reward_policy"] = function_of(formulas.reward)
+            hooks["_explain"] = explanation(rewards, self._terms(rewards), self._naming)
             hooks["_fault_reward"] = self._fault_reward()
-        if declared.costs or declared.has_reward_terms or declared.kpis:
-            hooks["_get_info"] = function_of(self._info())
+        if formulas.info:
+            hooks["_get_info"] = function_of(formulas.info)
         return hooks
 
-    def _updates_of_histories(self) -> list[Hook]:
+    def _updates_of_histories(self) -> list[Update]:
         """The sensors follow what they measure."""
-        first = self._naming.first_step
-        return [remember(kept, first) for kept in (self._kept, self._sensors) if kept]
+        return [remembered(self._naming, kept) for kept in (self._kept, self._sensors)]
 
     def _switched(self) -> dict[str, Value]:
         """What the task remembers of actions with a least time on or off, by variables."""
@@ -462,7 +479,7 @@ class ResolvedTask:
         reward = function_of(_sum(self._terms(self._declared.rewards)))
         return lambda env: min(0.0, reward(env))
 
-    def _condition(self, name: str) -> Hook:
+    def _condition(self, name: str) -> Value:
         entry = self._root.child(name)
         moment = Moment.AFTER if name == "terminated" else Moment.JUDGED
         value = self._naming.value(entry, self._declared.flags[name], moment)
@@ -470,7 +487,7 @@ class ResolvedTask:
             raise entry.error(
                 f"expected a condition such as 'x > 1', got {shown(entry.value.text)}"
             )
-        return function_of(value)
+        return value
 
     def _terms(self, terms: Mapping[str, Term], moment: Moment = Moment.JUDGED) -> dict[str, Value]:
         """Rewards or costs by name, weights included."""
@@ -497,27 +514,6 @@ class ResolvedTask:
         """Zeros before the first step, which has no rewards and costs yet."""
         has_stepped = self._naming.step_count > 0
         return {name: where(has_stepped, value, 0.0) for name, value in values.items()}
-
-
-def _assignments(values: Mapping[str, Value]) -> list[Hook]:
-    """A function that writes variables; none if there are no variables."""
-    if not values:
-        return []
-    names, function = list(values), function_of(list(values.values()))
-
-    def update(env: Any) -> None:
-        for name, value in zip(names, function(env), strict=True):
-            env.variables[name] = value
-
-    return [update]
-
-
-def _in_turn(updates: list[Hook]) -> Hook:
-    def update(env: Any) -> None:
-        for one in updates:
-            one(env)
-
-    return update
 
 
 def _box(limits: list[tuple[float, float]]) -> spaces.Box:

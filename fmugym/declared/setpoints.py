@@ -8,10 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression
 from fmugym.declared.format import RAMP, SETPOINT, SINE, STEPS
 from fmugym.declared.parts import Derived, Limits, Memory, read_limits
 from fmugym.declared.series import Series, read_schedule
+from fmugym.expressions.language import Expression
 
 __all__ = ["Deviation", "SetPoints", "Steps"]
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 from fmugym.archive.description import ModelDescription
 from fmugym.checks import Spellings, normal_form
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Expression
 from fmugym.declared.format import SETPOINT
 from fmugym.errors import ConfigError
+from fmugym.expressions.language import Expression
 from fmugym.keys import Table
 
 __all__ = ["as_declared"]

@@ -12,6 +12,7 @@ from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
+from fmugym.task.step import ORDER
 
 __all__ = ["TaskEnv"]
 
@@ -19,6 +20,11 @@ __all__ = ["TaskEnv"]
 _ARGUMENTS: Final = (
     *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "master", "scenario"),
 )
+
+_NOT_DECLARED: Final = frozenset(
+    {*ORDER, "step", "reset", "_get_action_space", "_get_observation_space", "_goal_reward"}
+)
+"""What a class may have of its own, so that hooks are more than the formulas of the task."""
 
 
 class TaskEnv(FMUEnv):
@@ -82,9 +88,15 @@ class TaskEnv(FMUEnv):
         self._observation_names, self._masks = resolved.observation_names, resolved.action_masks
         own = _own_hooks(type(self))
         own |= {"_explain"} if "_reward_policy" in own else set()
-        for name, function in resolved.hooks.items():
-            if name not in own:
-                setattr(self, name, MethodType(function, self))
+        functions = {
+            name: MethodType(function, self)
+            for name, function in resolved.hooks.items()
+            if name not in own
+        }
+        for name, function in functions.items():
+            setattr(self, name, function)
+        if not own & _NOT_DECLARED:
+            self.inside.formulas = resolved.formulas, functions
         with self.task.root.placing():
             super().__init__(
                 source,

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Final
 from fmugym.checks import check_text, normal_form, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_controller
-from fmugym.declared.expressions import Expression
-from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.variables import TaskVariable
-from fmugym.errors import shown, unknown_name
+from fmugym.errors import ConsequenceError, shown, unknown_name
+from fmugym.expressions.language import Expression
 
 if TYPE_CHECKING:
     from fmugym.baselines import Controller

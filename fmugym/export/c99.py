@@ -17,7 +17,7 @@ from fmugym.export.exportable import Agent
 from fmugym.export.layers import array, bare, c_type, network_lines
 from fmugym.export.names import identifiers, new_file
 from fmugym.export.operations import HELPERS, TYPES, constant, expression
-from fmugym.vector.hooks.graph import Node
+from fmugym.expressions.graph import Node
 
 __all__ = ["field_names", "header", "source", "write_c"]
 

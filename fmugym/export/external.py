@@ -13,7 +13,7 @@ from fmugym.declared.declarations import Declarations
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.export.names import identifier
-from fmugym.vector.hooks.graph import Graph
+from fmugym.expressions.graph import Graph
 
 __all__ = ["found_in"]
 

@@ -24,11 +24,11 @@ from fmugym.errors import ConfigError
 from fmugym.export.decisions import Decision
 from fmugym.export.external import found_in
 from fmugym.export.imperfections import without_imperfections
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.program import UntraceableError
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.patches import exclusive
-from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import LANES, as_symbols, loaded_rows, spread
 from fmugym.vector.hooks.tables import tables_in
 from fmugym.vector.hooks.trace import Tracer

@@ -13,8 +13,8 @@ import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.onnx_nodes import Nodes
-from fmugym.vector.hooks.graph import Cell, Graph, Node
-from fmugym.vector.hooks.program import letter_of, operation_of
+from fmugym.expressions.graph import Cell, Graph, Node
+from fmugym.expressions.program import letter_of, operation_of
 from fmugym.vector.hooks.symbols import Symbols
 
 __all__ = ["Operations"]

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import ConfigError
-from fmugym.vector.hooks.program import letter_of, operation_of
+from fmugym.expressions.program import letter_of, operation_of
 
 __all__ = ["HELPERS", "TYPES", "constant", "expression"]
 

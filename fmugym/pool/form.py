@@ -509,7 +509,7 @@ def form_of_program(
     seen: int,
     results: Sequence[int],
 ) -> bytes:
-    """The form of a program; see ``fmugym.vector.hooks.program``.
+    """The form of a program; see ``fmugym.expressions.program``.
 
     Args:
         code: The instructions.

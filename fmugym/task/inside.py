@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from threading import RLock
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.expressions.formulas import Formulas
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.base import FloatArray
 from fmugym.task.episode import EpisodeDraws
@@ -84,6 +85,8 @@ class Inside:
         has_chosen: Whether it is known if there is a player.
         draws: What is drawn for an episode.
         quantities: Lists what a declared task has names for; None for other tasks.
+        formulas: The formulas of a declared task, and the hooks that evaluate them by name; None
+            and nothing if hooks of a class are among them.
         future: What a declared task reads of the future; None for other tasks.
         controllers: Makes the simple controllers of a declared task; None for other tasks.
         signal_of: Of a declared task: makes a function of observations from an expression and the
@@ -122,6 +125,7 @@ class Inside:
     base: type
     elements: Any
     ended: bool
+    formulas: tuple[Formulas | None, Mapping[str, Any]]
     future: Future | None
     controllers: Callable[[], list[Any]] | None
     signal_of: Callable[[str, Sequence[str]], Callable[[Any], Any]] | None
@@ -174,6 +178,7 @@ class Inside:
         self.standing_in = RLock()
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
+        self.formulas = None, {}
         self.future = self.controllers = self.signal_of = self.model = None
         self.held = lambda: ()
         self.pictured = None, 0.0

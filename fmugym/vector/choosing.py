@@ -15,7 +15,8 @@ from fmugym.vector.engines.engine import Engine
 from fmugym.vector.engines.per_env import PerEnvEngine
 from fmugym.vector.engines.programs import find_programs
 from fmugym.vector.hooks.check import CURE, find_difference
-from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.hooks.formula_programs import formulas_of
+from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.making import EnvMaker
 
 __all__ = ["make_engine"]
@@ -45,7 +46,7 @@ def make_engine(
             envs, pool, max_episode_steps, batch_space(prototype.action_space, count)
         )
     if hooks == "array":
-        task = TracedTask.without_programs(prototype)
+        task = TaskPrograms.without_programs(prototype)
     else:
         task = find_programs(prototype, required=hooks == "compiled")
     return BatchEngine(prototype, count, max_episode_steps, task)
@@ -67,7 +68,7 @@ def _use_arrays(prototype: FMUEnv, hooks: str) -> bool:
     if hooks == "per_env":
         return False
     require_engine(f"a vector environment with hooks={hooks!r} instead of 'per_env'")
-    difference = find_difference(prototype)
+    difference = None if formulas_of(prototype) else find_difference(prototype)
     if difference is None:
         return True
     name = type(prototype).__name__

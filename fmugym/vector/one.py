@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
+from fmugym.expressions.program import UntraceableError
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, judged
 from fmugym.task.native_draws import no_draws
@@ -23,11 +24,11 @@ from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import attempt, compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
+from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.patches import exclusive
-from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.purity import names_in_hooks, require_pure
-from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.views import batched, column
 
 __all__ = ["Player", "player_of"]
@@ -311,7 +312,7 @@ class Watched(NamedTuple):
 
 def _watched_in(env: FMUEnv) -> Iterator[Watched]:
     """The attributes to which hooks refer by name, and the hooks themselves."""
-    attributes, names = vars(env), names_in_hooks(env)
+    attributes, names = vars(env), set() if formulas_of(env) else names_in_hooks(env)
     if "getattr" in names:
         names |= attributes.keys()
     for name in sorted((names - env.inside.own_names) | set(ORDER)):
@@ -321,8 +322,14 @@ def _watched_in(env: FMUEnv) -> Iterator[Watched]:
             yield Watched(name, value, deepcopy(value) if can_change else None)
 
 
-def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
-    """Compile the hooks, and compare the programs with them on states around the present one."""
+def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TaskPrograms:
+    """Compile the hooks, and compare the programs with them on states around the present one.
+
+    Formulas need no comparison.
+    """
+    formulas = formulas_of(env)
+    if formulas is not None:
+        return compile_formulas(env, formulas)
     if _is_debugged():
         raise UntraceableError("a debugger is attached")
     require_pure(env)

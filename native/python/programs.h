@@ -1,4 +1,4 @@
-/* Programs as Python hands them over: see fmugym/vector/hooks/program.py. */
+/* Programs as Python hands them over: see fmugym/expressions/program.py. */
 
 #ifndef FMUGYM_PROGRAMS_H
 #define FMUGYM_PROGRAMS_H

@@ -18,9 +18,9 @@ from vector_tools import require_same_alone
 import fmugym
 from fmugym import ConfigError, Task, TaskEnv, Uniform
 from fmugym.declared.declarations import BUILT_IN
-from fmugym.declared.expressions import CONSTANTS
-from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.errors import TaskError
+from fmugym.expressions.language import CONSTANTS
+from fmugym.expressions.mathematics import FUNCTIONS
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DOCS = Path(__file__).parents[2] / "docs"

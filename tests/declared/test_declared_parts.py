@@ -10,10 +10,11 @@ from fmugym import ConfigError
 from fmugym.archive.description import Unit
 from fmugym.archive.units import conversion_between
 from fmugym.checks import duration
-from fmugym.declared.computed import Value, function_of
-from fmugym.declared.expressions import Expression, Names
-from fmugym.declared.mathematics import FUNCTIONS
-from fmugym.vector.hooks.graph import Graph
+from fmugym.expressions.by_numpy import function_of
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.language import Expression, Names
+from fmugym.expressions.mathematics import FUNCTIONS
+from fmugym.expressions.value import Value
 
 
 class Env:

@@ -6,7 +6,7 @@ import time
 import pytest
 
 import fmugym
-from fmugym.declared.expressions import Expression
+from fmugym.expressions.language import Expression
 
 TASK = """
 fmu = {{ bundled = "Pendulum" }}

@@ -29,7 +29,7 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.export import Layer, Network, agent_of, write_c
 from fmugym.export.operations import HELPERS, TYPES, constant, expression
-from fmugym.vector.hooks.program import operation_of
+from fmugym.expressions.program import operation_of
 
 BALANCING = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.5, 10.0, 2.0]], np.float32)
 """The second action of a cart-pole is better than the first one where this feedback is positive."""

@@ -27,9 +27,9 @@ from fmugym import ConfigError
 from fmugym.export import agent_of, write_onnx
 from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import Operations
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.program import operation_of
 from fmugym.search.policy import Agent
-from fmugym.vector.hooks.graph import Graph
-from fmugym.vector.hooks.program import operation_of
 
 onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
 runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")

@@ -16,13 +16,13 @@ from test_native_pool import LOG, make, on_linux
 
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
+from fmugym.expressions.program import CONSTANT, SLOT
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
 from fmugym.pool.recorded_inputs import inputs_in
-from fmugym.vector.hooks.program import CONSTANT, SLOT
 
 
 @pytest.fixture

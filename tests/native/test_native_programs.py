@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from program_tools import code, constants
 
+from fmugym.expressions.program import SLOT, TYPES
 from fmugym.pool.form import form_of_program
-from fmugym.vector.hooks.program import SLOT, TYPES
 
 LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
 

@@ -27,6 +27,7 @@ from pool_tools import sampled
 from program_tools import code, constants, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
+from fmugym.expressions.program import SLOT
 from fmugym.pool import PoolSpec, native
 from fmugym.pool.form import (
     Files,
@@ -42,7 +43,6 @@ from fmugym.pool.play_form import form_of_play
 from fmugym.pool.process.channel import Channel
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.supervisor import Supervisor
-from fmugym.vector.hooks.program import SLOT
 
 LOG = logging.getLogger("fmugym.fuzz")
 ODD = (0, 1, 2, 3, 7, 255, -1, -2, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**61, 2**63 - 1, -(2**63))

@@ -33,12 +33,12 @@ from exchange_tools import exchange_fmu
 from program_tools import DISCRETE, code, constants, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
+from fmugym.expressions.program import TYPES
 from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
 from fmugym.task.values import UNFILLED, LateDict
-from fmugym.vector.hooks.program import TYPES
 
 THREADS = 6
 LONGEST_WAIT = 120.0

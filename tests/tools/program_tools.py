@@ -3,8 +3,8 @@
 import numpy as np
 
 from fmugym import _native
+from fmugym.expressions.program import CONSTANT, OPERATIONS
 from fmugym.pool.form import form_of_draws
-from fmugym.vector.hooks.program import CONSTANT, OPERATIONS
 
 DISCRETE = {
     "shape": (),

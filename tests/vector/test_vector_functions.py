@@ -5,10 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from fmugym.vector.hooks.graph import Graph
-from fmugym.vector.hooks.lowering import Store, compile_graph
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.lowering import Store, compile_graph
+from fmugym.expressions.program import UntraceableError, evaluate
 from fmugym.vector.hooks.patches import numpy_of
-from fmugym.vector.hooks.program import UntraceableError, evaluate
 from fmugym.vector.hooks.symbols import as_symbols, loaded_rows, same_for_all
 
 COUNT = 150

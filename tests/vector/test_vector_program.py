@@ -15,13 +15,13 @@ from vector_tools import (
 )
 
 from fmugym import Uniform
+from fmugym.expressions.program import UntraceableError
 from fmugym.task.construction import prepare_hooks
 from fmugym.task.readings import reading
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same as require_same_programs
-from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.trace import trace_hooks
 from fmugym.vector.views import some
 

@@ -45,7 +45,7 @@ from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
-from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.rollouts import costs_in
 from fmugym.vector.streams import EpisodeStreams
@@ -83,7 +83,7 @@ class BatchEngine(Engine):
     """
 
     def __init__(
-        self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
+        self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TaskPrograms
     ) -> None:
         super().__init__(num_envs)
         self.env = env
@@ -117,7 +117,7 @@ class BatchEngine(Engine):
         """The texts that a String draws from, and a place for an own one of each environment."""
         return np.array([*texts, *[None] * self._n], object)
 
-    def _prepare(self, task: TracedTask) -> None:
+    def _prepare(self, task: TaskPrograms) -> None:
         """Give the pool everything it needs for steps."""
         env, memory = self.env, self._memory
         draws, native = env.inside.draws, env.inside.draws.native
@@ -221,7 +221,7 @@ class BatchEngine(Engine):
         """Make other programs: they contain what attributes were, and know some parameters only."""
         if not self._task.is_compiled:
             return
-        task = TracedTask.without_programs(self.env)
+        task = TaskPrograms.without_programs(self.env)
         try:
             task = compile_hooks(self.env, [Readings.of(self.env)], self._columns)
         except Exception as reason:  # as in find_programs

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.vector.codec import mapped
-from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.hooks.task_programs import TaskPrograms
 
 __all__ = ["Layout"]
 
@@ -29,7 +29,7 @@ class Layout:
             an array, or a tuple of names and forms.
     """
 
-    def __init__(self, task: TracedTask, env: FMUEnv, count: int) -> None:
+    def __init__(self, task: TaskPrograms, env: FMUEnv, count: int) -> None:
         self._paths = [array.path for array in task.seen]
         self.shapes = tuple(((count, *array.shape), array.dtype) for array in task.seen)
         if not task.seen and env.inside.pool_observes:

@@ -12,11 +12,13 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.expressions.program import DifferenceError, UntraceableError
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import DifferenceError, UntraceableError
-from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
+from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.hooks.trace import trace_hooks
 
 __all__ = ["attempt", "compile_hooks", "find_programs"]
 
@@ -28,7 +30,7 @@ _WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
 """Magnitudes of other states that programs are compared with hooks on."""
 
 
-def find_programs(env: FMUEnv, required: bool) -> TracedTask:
+def find_programs(env: FMUEnv, required: bool) -> TaskPrograms:
     """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
 
     Args:
@@ -39,7 +41,10 @@ def find_programs(env: FMUEnv, required: bool) -> TracedTask:
         ConfigError: If the programs are required, but the hooks cannot be compiled.
     """
 
-    def make() -> TracedTask:
+    def make() -> TaskPrograms:
+        formulas = formulas_of(env)
+        if formulas is not None:
+            return compile_formulas(env, formulas)
         batches = [sample_states(env, scales) for scales in ((1.0,), _WILD_SCALES)]
         task = compile_hooks(env, batches)
         if required and task.left:
@@ -48,7 +53,7 @@ def find_programs(env: FMUEnv, required: bool) -> TracedTask:
 
     task = attempt(env, make, required, "on arrays")
     if task is None:
-        return TracedTask.without_programs(env)
+        return TaskPrograms.without_programs(env)
     for why in task.left.values():
         text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
         logger.info("%s. It runs on arrays, the others are compiled", text)
@@ -84,8 +89,10 @@ def compile_hooks(
     env: FMUEnv,
     batches: Sequence[Readings],
     attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
-) -> TracedTask:
-    """Trace hooks, and leave those to Python whose programs give other values than they.
+) -> TaskPrograms:
+    """Compile hooks: the formulas that they are, or what they do with symbols.
+
+    Those whose programs give other values than they are left to Python.
 
     Args:
         env: A prototype whose hooks work on arrays.
@@ -96,6 +103,9 @@ def compile_hooks(
     Raises:
         UntraceableError: As ``trace_hooks`` does.
     """
+    formulas = formulas_of(env)
+    if formulas is not None:
+        return compile_formulas(env, formulas)
     refused: dict[str, str] = {}
     while True:
         task = trace_hooks(env, attributes, refused)

@@ -10,25 +10,25 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.task import spaces as fmu_spaces
-from fmugym.task.readings import Readings, reading
-from fmugym.vector.contents import borrowed
-from fmugym.vector.hooks import hook_results
-from fmugym.vector.hooks.graph import TOLERANCES
-from fmugym.vector.hooks.memory import Memory
-from fmugym.vector.hooks.program import (
+from fmugym.expressions.graph import TOLERANCES
+from fmugym.expressions.program import (
     DifferenceError,
     UntraceableError,
     evaluate,
     writes_variable,
 )
-from fmugym.vector.hooks.trace import TracedTask
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.readings import Readings, reading
+from fmugym.vector.contents import borrowed
+from fmugym.vector.hooks import hook_results
+from fmugym.vector.hooks.memory import Memory
+from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.views import some
 
 __all__ = ["require_same"]
 
 
-def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
+def require_same(env: FMUEnv, batch: Readings, task: TaskPrograms) -> None:
     """Run programs in C and hooks on arrays, and compare all results.
 
     They must be equal to the last bit: NaNs are equal, zeros of different sign are not. Where hooks
@@ -53,7 +53,7 @@ def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
 
 
 class _Comparison:
-    def __init__(self, env: FMUEnv, task: TracedTask) -> None:
+    def __init__(self, env: FMUEnv, task: TaskPrograms) -> None:
         self._env, self._task = env, task
         self._count = len(env.step_count)
         rows: Any = [*task.inputs.rows, *task.judgement.rows]

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.program import UntraceableError, is_function, letter_of, operation_of
 from fmugym.vector.hooks import products, tables
-from fmugym.vector.hooks.graph import Graph
-from fmugym.vector.hooks.program import UntraceableError, is_function, letter_of, operation_of
 from fmugym.vector.hooks.symbols import (
     Symbols,
     as_symbols,

@@ -10,12 +10,12 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.expressions.program import LETTERS, Row
 from fmugym.pool.base import FloatArray, MaskArray, Play, Pool
 from fmugym.task.episode import Draw
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks import hook_results
-from fmugym.vector.hooks.program import LETTERS, Row
-from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.hooks.task_programs import TaskPrograms
 
 __all__ = ["Memory"]
 
@@ -56,7 +56,7 @@ class Memory:
         self.variables: dict[str, npt.NDArray[Any]] = {}
         self.before: dict[str, npt.NDArray[Any]] = {}
 
-    def hold(self, task: TracedTask) -> None:
+    def hold(self, task: TaskPrograms) -> None:
         """Make the arrays of the episode variables in the types that programs store."""
         self.variables, self.before = {}, {}
         for name, dtype in task.variables.items():
@@ -83,7 +83,7 @@ class Memory:
     def prepare(
         self,
         pool: Pool,
-        task: TracedTask,
+        task: TaskPrograms,
         starts: FloatArray,
         draws: tuple[Any, Sequence[Draw], npt.NDArray[np.uint64]],
         limit: int,
@@ -158,7 +158,7 @@ class Memory:
         }
 
     def _surroundings(
-        self, task: TracedTask, drawn: Sequence[Draw], results: tuple[Any, ...]
+        self, task: TaskPrograms, drawn: Sequence[Draw], results: tuple[Any, ...]
     ) -> dict[str, Any]:
         """What the pool keeps beside the programs; see ``NativePool.prepare_play``.
 

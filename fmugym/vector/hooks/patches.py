@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.expressions.graph import Graph
 from fmugym.vector.hooks import tables
 from fmugym.vector.hooks.functions import COMPOSED, full_like
-from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.symbols import LANES, as_symbols, has_symbols, lift
 
 __all__ = ["exclusive", "numpy_of"]

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.vector.hooks.program import UntraceableError
+from fmugym.expressions.program import UntraceableError
 from fmugym.vector.hooks.symbols import LANES, as_symbols, graph_of
 
 __all__ = ["FUNCTIONS", "matmul"]

@@ -10,8 +10,8 @@ import gymnasium
 import numpy as np
 
 from fmugym.env import FMUEnv
+from fmugym.expressions.program import UntraceableError
 from fmugym.vector.contents import OURS
-from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.tables import defaults_of, functions_of, names_in, places_of
 
 __all__ = ["names_in_hooks", "require_pure", "unrepeatable"]

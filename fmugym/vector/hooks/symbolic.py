@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from fmugym.env import FMUEnv
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.program import UntraceableError
 from fmugym.task.readings import Readings
 from fmugym.task.values import NamedValues, ParameterValues
-from fmugym.vector.hooks.graph import Graph
-from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import LANES, lift, loaded, loaded_rows
 from fmugym.vector.views import batched
 

@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.vector.hooks.graph import Cell, Graph
-from fmugym.vector.hooks.program import UntraceableError, letter_of
+from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.program import UntraceableError, letter_of
 
 __all__ = [
     "LANES",

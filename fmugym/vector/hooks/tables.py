@@ -15,9 +15,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.program import UntraceableError
 from fmugym.task.step import ORDER
-from fmugym.vector.hooks.graph import Cell, Graph
-from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import (
     Symbols,
     as_symbols,

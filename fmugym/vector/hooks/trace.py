@@ -10,7 +10,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, TypeVar, cast
 
@@ -19,19 +18,20 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.lowering import Store, compile_graph
+from fmugym.expressions.program import TYPES, Program, UntraceableError
+from fmugym.expressions.value import Value
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.step import ORDER
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.hook_results import type_of_variable
-from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
-from fmugym.vector.hooks.program import TYPES, Program, UntraceableError
 from fmugym.vector.hooks.symbolic import symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
     as_symbols,
+    each,
     loaded,
     loaded_rows,
     same_cells,
@@ -39,29 +39,12 @@ from fmugym.vector.hooks.symbols import (
     spread,
 )
 from fmugym.vector.hooks.tables import Table, is_table, tables_in
+from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
 
 __all__ = [
-    "SeenArray",
-    "TracedTask",
     "Tracer",
-    "of_input_type",
     "trace_hooks",
 ]
-
-
-@dataclass(frozen=True)
-class SeenArray:
-    """An array of observations or infos that a program stores.
-
-    Attributes:
-        path: The keys that lead to it: ``"observation"`` or ``"info"``, then names.
-        shape: The shape of one environment's part.
-        dtype: Its type.
-    """
-
-    path: tuple[str, ...]
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
 
 
 _Made = TypeVar("_Made")
@@ -70,63 +53,11 @@ _Seen = tuple[tuple[str, ...], npt.NDArray[Any], np.dtype[Any]]
 """The path and the type of a ``SeenArray``, and the nodes of the values in it."""
 
 
-@dataclass(frozen=True)
-class TracedTask:
-    """The programs of a task.
-
-    Attributes:
-        inputs: From the action to the inputs.
-        judgement: From the outputs to done, truncated and reward; it stores the episode variables,
-            the observation if it is not the default one, and the info.
-        seen: The arrays that the second program stores.
-        variables: The types of the episode variables by name.
-        updated: The names of the variables that ``_update`` writes.
-        left: The hooks that cannot be traced, and why. They run on arrays; no other hook needs
-            what they return.
-        tolerance: How far results may differ from those of hooks on arrays, relative to the largest
-            one: 0 if there are no functions of the C library and no products of matrices.
-    """
-
-    inputs: Program
-    judgement: Program
-    seen: tuple[SeenArray, ...]
-    variables: Mapping[str, np.dtype[Any]]
-    updated: tuple[str, ...]
-    left: Mapping[str, str]
-    tolerance: float = 0.0
-
-    @classmethod
-    def without_programs(cls, env: FMUEnv) -> TracedTask:
-        """A task whose hooks all run on arrays; a program only passes on that an FMU stops."""
-        inside, graph, flag = env.inside, Graph(), np.dtype(np.bool_)
-        idle = {
-            "_update": not inside.own.update,
-            "_is_truncated": not inside.own.is_truncated,
-            "_get_observation": inside.pool_observes,
-            "_get_info": not inside.has_info,
-        }
-        stopped = graph.load("stopped", None, flag, None)
-        others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
-        judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
-        left = {hook: "" for hook in ORDER if not idle.get(hook, False)}
-        return cls(compile_graph(Graph(), [], [], 0), judgement, (), {}, (), left)
-
-    def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TracedTask:
-        """The same task with other tables, by the bytes of those whose place they take."""
-        inputs, judgement = (one.with_tables(tables) for one in (self.inputs, self.judgement))
-        return replace(self, inputs=inputs, judgement=judgement)
-
-    @property
-    def is_compiled(self) -> bool:
-        """Whether there are programs of hooks."""
-        return "_is_done" not in self.left
-
-
 def trace_hooks(
     env: FMUEnv,
     attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
     refused: Mapping[str, str] = MappingProxyType({}),
-) -> TracedTask:
+) -> TaskPrograms:
     """Trace the hooks of an environment.
 
     Args:
@@ -184,7 +115,7 @@ class Tracer:
                 return made
         raise UntraceableError("_update gives a variable another type in each step")
 
-    def task(self) -> TracedTask:
+    def task(self) -> TaskPrograms:
         """Trace all hooks."""
         self._left = {}
         inputs = self._trace_inputs()
@@ -200,7 +131,7 @@ class Tracer:
         results = [int(same_for_all(one)) for one in (done, truncated, rewards)]
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
         parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
-        return TracedTask(*parts, max(tolerance, self._graph.tolerance))
+        return TaskPrograms(*parts, max(tolerance, self._graph.tolerance))
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
@@ -264,8 +195,14 @@ class Tracer:
         if len(value) != len(variables):
             raise UntraceableError("the number of inputs is not that of the config")
         rows = [self._row(row, np.float64) for row in value]
-        typed = map(of_input_type, variables, rows)
+        typed = [
+            row.like(each(lambda cell, v=v: self._typed(v, cell), row.cells))
+            for v, row in zip(variables, rows, strict=True)
+        ]
         return [int(same_for_all(row)) for row in typed]
+
+    def _typed(self, variable: Any, cell: Cell) -> Cell:
+        return to_input_type(variable, Value(self._graph, cell)).cell
 
     # What follows the FMU's step.
 
@@ -371,45 +308,6 @@ def _stores(parts: list[_Seen]) -> list[Store]:
         for number, (_, nodes, _) in enumerate(parts)
         for place, node in enumerate(nodes.reshape(-1))
     ]
-
-
-def of_input_type(variable: Any, value: Any) -> Any:
-    """Round a value to its input's type, as ``to_input_types`` does.
-
-    A value that is outside of the type's range becomes NaN, which no pool steps with.
-    """
-    if variable.type in {"Real", "Float64"}:
-        return value
-    if variable.kind == "boolean":
-        return np.where(np.isfinite(value), np.where(value >= 0.5, 1.0, 0.0), value)
-    if variable.kind in {"integer", "enumeration"}:
-        return to_integer(variable, value)
-    limit = float(np.finfo(np.float32).max)
-    return np.where(np.absolute(value) <= limit, value, np.nan)
-
-
-def to_integer(variable: Any, value: Any) -> Any:
-    """The nearest integer, or the nearest item of an Enumeration; NaN outside of the range."""
-    low, high = variable.integer_limits
-    largest = 2.0**53
-    rounded: Any = np.rint(value) + 0.0  # an integer has no negative zero
-    items = [item for _, item in variable.items]
-    if items:
-        low, high = min(items), max(items)
-        rounded = _nearest(items, rounded)
-    within = (rounded >= float(max(low, -largest))) & (rounded <= float(min(high, largest)))
-    return np.where(within, rounded, np.where(np.isfinite(value), np.nan, value))
-
-
-def _nearest(items: list[int], value: Any) -> Any:
-    """The nearest of some items, the first of those that are as near; others stay."""
-    if set(items) == set(range(min(items), max(items) + 1)):
-        return value
-    nearest: Any = np.full_like(value, float(items[0]))
-    for item in items[1:]:
-        nearest = np.where(abs(item - value) < abs(nearest - value), float(item), nearest)
-    inside = (value >= min(items)) & (value <= max(items))
-    return np.where(inside, nearest, value)
 
 
 @contextmanager

@@ -1,8 +1,4 @@
-"""The functions of expressions, and what functions of Python call to compute them.
-
-In Python all of them give one number the same value, to the last bit, as an element of an array:
-they are numpy's functions, or operators that IEEE 754 settles.
-"""
+"""The functions of expressions, and others of the same values: random numbers, for example."""
 
 from __future__ import annotations
 
@@ -12,95 +8,20 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "FUNCTIONS",
-    "Function",
-    "chance",
-    "chosen",
-    "clip",
-    "divide",
-    "float32",
-    "float64",
-    "interpolated",
-    "looked_up",
-    "maximum",
-    "minimum",
-    "noise",
-    "remainder",
-    "square",
-]
+__all__ = ["FUNCTIONS", "Function", "chance", "clip", "maximum", "minimum", "noise"]
 
 
 class Function(NamedTuple):
     """A function that expressions may call.
 
     Attributes:
-        call: Returns the value for some values; see ``fmugym.declared.computed``.
+        call: Returns the value for some values; see ``fmugym.expressions.value``.
         fewest, most: How many arguments it takes; None for any number.
     """
 
     call: Callable[..., Any]
     fewest: int = 1
     most: int | None = 1
-
-
-# What functions of Python call, with numbers, arrays or symbols.
-
-
-def divide(first: Any, second: Any) -> Any:
-    """A quotient; by 0, it is not finite."""
-    try:
-        return first / second
-    except ZeroDivisionError:  # Python's floats raise where numpy gives an infinity or NaN
-        return np.divide(first, second)
-
-
-def remainder(first: Any, second: Any) -> Any:
-    """What is left of a division; by 0, it is NaN."""
-    try:
-        return first % second
-    except ZeroDivisionError:
-        return np.remainder(first, second)
-
-
-def chosen(condition: Any, first: Any, second: Any) -> Any:
-    """The first number where a condition holds, otherwise the second."""
-    if isinstance(condition, bool | np.bool_):
-        return np.float64(first if condition else second)  # the type that numpy.where gives
-    values = np.where(condition, first, second)
-    return values if values.ndim else values[()]  # a number if all are numbers
-
-
-def float32(value: Any) -> Any:
-    """Round to the nearest number that a float32 can hold."""
-    return np.positive(value, dtype=np.float32)
-
-
-def float64(value: Any) -> Any:
-    """The same number as a float64."""
-    return np.positive(value, dtype=np.float64)
-
-
-def square(value: Any) -> Any:
-    """The square of a number as a float64."""
-    return np.square(value, dtype=np.float64)
-
-
-def looked_up(table: Any, index: Any) -> Any:
-    """The number with this index in a table."""
-    if isinstance(index, int | np.integer):
-        return float(table[index])
-    return np.take(table, index)  # looked up in each call: it is replaced while hooks are traced
-
-
-def interpolated(tables: Any, key: Any, place: Any) -> Any:
-    """The number at a place of a table, on straight lines; see ``Value.interpolated``.
-
-    The table is found in each call, since another one may have taken its place.
-    """
-    table = tables[key]
-    count = len(table) // 2 - 1
-    return np.interp(place, table[:count], table[count:-2], table[-2], table[-1])
 
 
 _STEP: Final = np.int64(0x9E3779B97F4A7C15 - 2**64)
@@ -126,8 +47,8 @@ def _mixed(word: Any) -> Any:
 
 def _word(key: Any, count: Any, channel: int) -> Any:
     """64 random bits that are a function of the arguments; see ``noise``."""
-    episode = _mixed(np.asarray(key).astype(np.int64) + _STEP)
-    return _mixed(episode + np.asarray(count).astype(np.int64) * _STEP + np.int64(channel))
+    episode = _mixed(key.cast(np.int64) + _STEP)
+    return _mixed(episode + count.cast(np.int64) * _STEP + np.int64(channel))
 
 
 def _fraction(word: Any) -> Any:
@@ -154,9 +75,6 @@ def noise(key: Any, count: Any, channel: int) -> Any:
     first = _fraction(_mixed(word + _STEP)) + _FRACTION  # the logarithm of 0 is not finite
     second = _fraction(_mixed(word + _STEP + _STEP))
     return np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
-
-
-# What expressions call, with values of a task.
 
 
 def clip(value: Any, low: Any, high: Any) -> Any:

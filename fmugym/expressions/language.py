@@ -1,13 +1,14 @@
 """Expressions: arithmetic over the names of a task, as text.
 
 The grammar is a part of Python's: numbers, names, ``+ - * / % **``, comparisons, ``and``, ``or``,
-``not``, ``a if condition else b``, and calls of the functions of ``fmugym.declared.mathematics``.
-``previous(x)`` is the value of ``x`` before the step. There are no attributes, subscripts, texts or
-assignments. Each value is a number or a condition; in arithmetic a condition counts as 0 or 1.
+``not``, ``a if condition else b``, and calls of functions, see ``FUNCTIONS`` in
+``fmugym.expressions.mathematics``. ``previous(x)`` is the value of ``x`` before the step. There are
+no attributes, subscripts, texts or assignments. Each value is a number or a condition; in
+arithmetic a condition counts as 0 or 1.
 
-An expression becomes a value, see ``fmugym.declared.computed``. Its only names are those that the
-caller gives. It works element by element, so that it serves one environment, arrays of them, and
-the trace that compiles hooks.
+An expression becomes nodes of a graph, see ``fmugym.expressions.value``. Its only names are those
+that the caller gives. It works element by element, so that it serves one environment and arrays of
+them.
 """
 
 from __future__ import annotations
@@ -25,11 +26,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.checks import float_or_nan
-from fmugym.declared.computed import Value, where
-from fmugym.declared.mathematics import FUNCTIONS
-from fmugym.declared.mistakes import ConsequenceError
-from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.vector.hooks.graph import Graph
+from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.mathematics import FUNCTIONS
+from fmugym.expressions.value import Value, where
 
 __all__ = ["CONSTANTS", "Expression", "Names"]
 

@@ -8,8 +8,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.vector.hooks.graph import Graph, Node
-from fmugym.vector.hooks.program import (
+from fmugym.expressions.graph import Graph, Node
+from fmugym.expressions.program import (
     CONSTANT,
     MOST_REGISTERS,
     OPERATIONS,

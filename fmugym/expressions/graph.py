@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.vector.hooks.program import UntraceableError, is_function, letter_of, operation_of
+from fmugym.expressions.program import UntraceableError, is_function, letter_of, operation_of
 
 __all__ = ["TOLERANCES", "Cell", "Graph", "Node"]
 
@@ -21,8 +21,7 @@ class Node(NamedTuple):
 
     Attributes:
         kind: ``constant``, ``row``, ``action``, ``previous_action``, ``active``, ``stopped``,
-            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``; in the graphs
-            of declared tasks also ``function``, which is one of Python.
+            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``.
         what: The value, the row, the element, the reason, the function or the table.
         operands: The numbers of the nodes that it is computed from.
         dtype: The type of the value.
@@ -127,8 +126,12 @@ class Graph:
             values = [_array([self.value(cell)]) for cell in cells]
             with np.errstate(all="ignore"):
                 return self.constant(fold(*values)[0], dtype)
+        return Cell(self.add(kind, what, cells, dtype).node, lanes.pop() if lanes else None)
+
+    def add(self, kind: str, what: Any, cells: tuple[Cell, ...], dtype: np.dtype[Any]) -> Cell:
+        """A node as it is in another graph, the same for all environments."""
         operands = tuple(cell.node for cell in cells)
-        return Cell(self._number(Node(kind, what, operands, dtype)), lanes.pop() if lanes else None)
+        return Cell(self._number(Node(kind, what, operands, dtype)), None)
 
     def cast(self, cell: Cell, dtype: np.dtype[Any]) -> Cell:
         """The value in another type."""

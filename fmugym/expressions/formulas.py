@@ -1,0 +1,36 @@
+"""What a task computes around the steps of its FMU, as values of one graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from fmugym.expressions.value import Computed, Value
+
+__all__ = ["Formulas", "Update"]
+
+Update = Mapping[str, Value | Sequence[Value]]
+"""New values of episode variables by name; all of them are computed before one is written."""
+
+
+@dataclass(frozen=True)
+class Formulas:
+    """The formulas of a task, in the order of a step.
+
+    Attributes:
+        inputs: The FMU's inputs; None for the elements of the action.
+        updates: What is written to episode variables when the FMU has stepped, one after the other.
+        terminated: Whether the task has ended; None for never.
+        truncated: Whether the episode is cut off; None for never.
+        reward: The reward; None if a hook of a class tells it.
+        observation: The elements of the observation; None for the outputs.
+        info: Facts about the step by name.
+    """
+
+    inputs: Sequence[Value] | None
+    updates: Sequence[Update]
+    terminated: Value | None
+    truncated: Value | None
+    reward: Value | None
+    observation: Sequence[Value] | None
+    info: Mapping[str, Computed]

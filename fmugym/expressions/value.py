@@ -1,0 +1,172 @@
+"""Numbers and conditions of a task, as nodes of its graph.
+
+The graph is made when a task is loaded: equal nodes stand in it once, and what consists of
+constants is computed at once. Its operations are those of programs, see
+``fmugym.expressions.program``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.errors import ConfigError
+from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.program import operation_of
+
+__all__ = ["Computed", "Value", "where"]
+
+_MOST_NODES: Final = 100_000
+"""A forecast of 2000 values with errors that grow and last, normalized, takes some 80,000."""
+
+_DOUBLE: Final = np.dtype(np.float64)
+
+
+def _operator(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
+    def apply(own: Value, other: Any) -> Value:
+        value: Value = ufunc(own, other)
+        return value
+
+    return apply
+
+
+class Value:
+    """A number or a condition of an environment.
+
+    Operators and functions of numpy, such as ``value + 1`` and ``np.sin(value)``, make new nodes.
+
+    Args:
+        graph: Has the node.
+        cell: Refers to it.
+
+    Raises:
+        ConfigError: If there are too many nodes.
+    """
+
+    __slots__ = ("cell", "graph")
+
+    def __init__(self, graph: Graph, cell: Cell) -> None:
+        self.graph, self.cell = graph, cell
+        if len(graph.nodes) > _MOST_NODES:
+            raise ConfigError(f"the task has too many terms: it computes more than {_MOST_NODES}")
+
+    @classmethod
+    def of(cls, graph: Graph, number: float | bool) -> Value:
+        """The node of a constant."""
+        return cls(graph, graph.constant(number, _type_of(number)))
+
+    @classmethod
+    def read(
+        cls, graph: Graph, attribute: str, *keys: str | int, dtype: npt.DTypeLike = _DOUBLE
+    ) -> Value:
+        """The node of a value that an environment has when it is asked.
+
+        Args:
+            graph: Gets the node.
+            attribute: The attribute of the environment.
+            keys: What to index it with, one key after the other.
+            dtype: The type of the value.
+        """
+        return cls(graph, graph.load("row", (attribute, *keys), dtype, None))
+
+    @property
+    def node(self) -> int:
+        """The number of the node."""
+        return self.cell.node
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The type of the value."""
+        return self.graph.node(self.cell).dtype
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it is a condition, not a number."""
+        return self.dtype == np.bool_
+
+    @property
+    def constant(self) -> float | bool | None:
+        """The value if it is a constant."""
+        known = self.graph.value(self.cell)
+        return None if known is None else known.item()
+
+    @property
+    def number(self) -> Value:
+        """The same as a float64: 0 or 1 for a condition."""
+        return self.cast(_DOUBLE)
+
+    def cast(self, dtype: npt.DTypeLike) -> Value:
+        """The value in another type."""
+        return Value(self.graph, self.graph.cast(self.cell, np.dtype(dtype)))
+
+    def taken(self, table: Hashable) -> Value:
+        """The value in a table of the graph, of which this is the index."""
+        return self._looked_up("take", table, self.graph.tables[table].dtype)
+
+    def interpolated(self, table: Hashable) -> Value:
+        """The value on the straight lines between points, of which this is the coordinate.
+
+        Args:
+            table: A table of the graph: the coordinates, the values there, and those before the
+                first point and after the last one.
+        """
+        return self.cast(_DOUBLE)._looked_up("interpolate", table, _DOUBLE)
+
+    def _looked_up(self, kind: str, table: Hashable, dtype: np.dtype[Any]) -> Value:
+        return Value(self.graph, self.graph.compute(kind, table, (self.cell,), dtype, None))
+
+    __add__ = __radd__ = _operator(np.add)
+    __sub__, __mod__ = _operator(np.subtract), _operator(np.remainder)
+    __mul__ = __rmul__ = _operator(np.multiply)
+    __truediv__ = _operator(np.divide)
+    __lt__, __gt__ = _operator(np.less), _operator(np.greater)
+    __le__, __ge__ = _operator(np.less_equal), _operator(np.greater_equal)
+    # Comparisons make nodes instead of bools, and so there is no hash.
+    __eq__, __ne__ = _operator(np.equal), _operator(np.not_equal)  # type: ignore[assignment]
+    __and__, __or__ = _operator(np.bitwise_and), _operator(np.bitwise_or)
+    __xor__, __rshift__ = _operator(np.bitwise_xor), _operator(np.right_shift)
+    __hash__ = None  # type: ignore[assignment]
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *operands: Any, **keywords: Any) -> Any:
+        if method != "__call__" or keywords:
+            return NotImplemented
+        values = [self.beside(one) for one in operands]
+        if all(one.is_flag for one in values) and operation_of(ufunc, "?") is None:
+            values = [one.cast(np.int64) for one in values]
+        *types, dtype = ufunc.resolve_dtypes((*(one.dtype for one in values), None))
+        cast = [one.cast(wanted) for one, wanted in zip(values, types, strict=True)]
+        if ufunc in _MADE_OF:
+            return _MADE_OF[ufunc](*cast)
+        return Value(self.graph, self.graph.apply(ufunc, tuple(v.cell for v in cast), dtype))
+
+    def beside(self, operand: Any) -> Value:
+        """A value or a number as a value of the same graph."""
+        return operand if isinstance(operand, Value) else Value.of(self.graph, operand)
+
+
+def _type_of(number: float | bool) -> np.dtype[Any]:
+    if isinstance(number, bool | np.bool_):
+        return np.dtype(np.bool_)
+    return np.dtype(np.int64) if isinstance(number, int | np.integer) else _DOUBLE
+
+
+def where(condition: Value, first: Value | float, second: Value | float) -> Value:
+    """The first number where a condition holds, otherwise the second."""
+    graph = condition.graph
+    cells = [condition.beside(one).cast(_DOUBLE).cell for one in (first, second)]
+    return Value(graph, graph.choose(condition.cell, *cells))
+
+
+_MADE_OF: Final[Mapping[Any, Callable[[Value], Value]]] = {
+    np.square: lambda x: x * x,
+    np.radians: lambda x: x * (np.pi / 180.0),
+    np.degrees: lambda x: x * (180.0 / np.pi),
+    np.sign: lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, x + 0.0)),
+}
+"""Functions that operations make up, as numpy does."""
+
+Computed = Value | Sequence["Computed"] | Mapping[str, "Computed"]
+"""What a task computes: one value, or a list or a dict of them."""

@@ -1,0 +1,257 @@
+"""From the formulas of a task to its programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.env import FMUEnv
+from fmugym.expressions.formulas import Formulas
+from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.lowering import Store, compile_graph
+from fmugym.expressions.program import Program, UntraceableError, letter_of
+from fmugym.expressions.value import Computed, Value, where
+from fmugym.task.step import ORDER
+from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
+
+__all__ = ["compile_formulas", "formulas_of"]
+
+_DOUBLE: Final = np.dtype(np.float64)
+_FLAG: Final = np.dtype(np.bool_)
+
+_Seen = tuple[SeenArray, list[Value]]
+"""An array that a program stores, and its elements."""
+
+
+def formulas_of(env: FMUEnv) -> Formulas | None:
+    """The formulas that the hooks of an environment are; None if one of them is another function.
+
+    A function that is assigned to a hook later takes the place of its formula.
+    """
+    formulas, functions = env.inside.formulas
+    assigned = vars(env)
+    is_same = all(assigned.get(name) is functions.get(name) for name in ORDER)
+    return formulas if is_same else None
+
+
+def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
+    """Make the programs of a task.
+
+    Args:
+        env: An environment of the task.
+        formulas: What the task computes.
+
+    Raises:
+        UntraceableError: If programs do not have its actions or observations, or it is too long.
+    """
+    if env.inside.pool_tells:
+        raise UntraceableError("the pool tells infos of its own")
+    letter_of(np.dtype(env.action_space.dtype))
+    judgement, seen, updated = _Judgement(env, formulas).made()
+    types = dict.fromkeys(env.variables, _DOUBLE)
+    return TaskPrograms(_inputs(env, formulas), judgement, seen, types, updated, {})
+
+
+def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
+    """The program from the action to the inputs."""
+    graph = Graph()
+    values = _Readings(env, graph, has_stepped=False)
+    given = formulas.inputs
+    inputs = values.elements_of_action() if given is None else map(values.of, given)
+    variables = env.inside.interface.inputs
+    typed = [to_input_type(v, value.number) for v, value in zip(variables, inputs, strict=True)]
+    return compile_graph(graph, [Store(v.node, ("input", i)) for i, v in enumerate(typed)], [], 0)
+
+
+class _Readings:
+    """The values of a task's graph in the graph of a program.
+
+    Args:
+        env: An environment of the task.
+        graph: That of the program.
+        has_stepped: Whether the FMU has stepped.
+        known: Those that are no rows any more: the variables that are written, and ``done``.
+    """
+
+    def __init__(
+        self,
+        env: FMUEnv,
+        graph: Graph,
+        has_stepped: bool,
+        known: Mapping[Any, Value] | None = None,
+    ) -> None:
+        self._env, self._graph, self._has_stepped = env, graph, has_stepped
+        self._known = {} if known is None else known
+        self._cells: dict[int, Cell] = {}
+
+    def of(self, value: Value) -> Value:
+        """The same value in the graph of the program."""
+        source = value.graph
+        for number in source.needed([value.node], self._cells):
+            if number not in self._cells:
+                kind, what, operands, dtype = source.nodes[number]
+                if kind == "row":
+                    self._cells[number] = self._read(what).cast(dtype).cell
+                    continue
+                if kind in ("take", "interpolate"):
+                    self._graph.tables[what] = source.tables[what]
+                cells = tuple(self._cells[one] for one in operands)
+                self._cells[number] = self._graph.add(kind, what, cells, dtype)
+        return Value(self._graph, self._cells[value.node])
+
+    def elements_of_action(self) -> list[Value]:
+        """The numbers that the default of ``_get_inputs`` gives."""
+        space, values = self._env.action_space, self._env.inside.action_values
+        count = int(np.prod(space.shape or (), dtype=int))
+        elements = [self._loaded("action", index) for index in range(count)]
+        if isinstance(values, range):
+            return [one + values[0] for one in elements]
+        if values is None:
+            return elements
+        self._graph.tables["values of the action"] = np.array(values)
+        return [one.taken("values of the action") for one in elements]
+
+    def variable(self, name: str, place: int) -> Value:
+        """An element of an episode variable before this step wrote it."""
+        return self._row("before" if self._has_stepped else "variable", name, place)
+
+    def output(self, place: int) -> Value:
+        """A value that is read from the FMU."""
+        return self._row("output", place)
+
+    def _row(self, *what: Any, dtype: np.dtype[Any] = _DOUBLE) -> Value:
+        return Value(self._graph, self._graph.load("row", what, dtype, None))
+
+    def _loaded(self, attribute: str, index: int) -> Value:
+        dtype = np.dtype(self._env.action_space.dtype)
+        return Value(self._graph, self._graph.load(attribute, index, dtype, None))
+
+    def _read(self, what: Any) -> Value:
+        """What an environment has, see ``Value.read``."""
+        attribute, *keys = what
+        if what in self._known:
+            return self._known[what]
+        match attribute, keys:
+            case "inside.readings.values", [place]:
+                return self.output(place)
+            case "previous_state", [place]:
+                return self._row("kept", place) if self._has_stepped else self.output(place)
+            case "inputs", [place]:
+                return self._row("input", place)
+            case "parameters", [name]:
+                return self._row("parameter", name, 0)
+            case "variables", [name, *places]:
+                return self.variable(name, places[0] if places else 0)
+            case "action" | "previous_action", places:
+                return self._loaded(attribute, places[0] if places else 0)
+            case "step_count", []:
+                return self._row("step_count", 0, dtype=np.dtype(np.int64))
+            case "time", []:
+                return self._time()
+        raise UntraceableError(f"programs do not read {attribute!r}")
+
+    def _time(self) -> Value:
+        """The time of the FMU, as ``FMUEnv.time`` computes it."""
+        env, spec = self._env, self._env.inside.spec
+        start: Value | float = spec.start_time
+        if env.config.draws_start_time:
+            start = self._row("parameter", "start_time", 0)
+        count: Value = (self._read(("step_count",)) + env.inside.warm_up_steps) * spec.substeps
+        return count * spec.time_step / spec.substeps + start
+
+
+class _Judgement:
+    """The program that follows the FMU's step.
+
+    Args:
+        env: An environment of the task.
+        formulas: What the task computes.
+    """
+
+    def __init__(self, env: FMUEnv, formulas: Formulas) -> None:
+        self._env, self._formulas, self._graph = env, formulas, Graph()
+        self._known: dict[Any, Value] = {}
+
+    def made(self) -> tuple[Program, tuple[SeenArray, ...], tuple[str, ...]]:
+        """The program, the arrays that it stores, and the variables that it writes."""
+        formulas, graph = self._formulas, self._graph
+        stores, updated = self._update()
+        done = self._told("stopped")
+        if formulas.terminated is not None:
+            done = self._values().of(formulas.terminated) | done
+        self._known["done",] = done
+        values = self._values()
+        truncated, reward = (
+            values.of(one) if one is not None else Value.of(graph, default)
+            for one, default in ((formulas.truncated, False), (formulas.reward, 0.0))
+        )
+        self._known["done",] = done & self._told("active")  # an episode starts elsewhere
+        seen = self._seen()
+        more = [
+            Store(value.node, None, (number, place, len(values)))
+            for number, (_, values) in enumerate(seen)
+            for place, value in enumerate(values)
+        ]
+        results = [done.node, truncated.node, reward.node]
+        program = compile_graph(graph, stores + more, results, len(seen))
+        return program, tuple(array for array, _ in seen), updated
+
+    def _values(self) -> _Readings:
+        return _Readings(self._env, self._graph, True, dict(self._known))
+
+    def _told(self, kind: str) -> Value:
+        """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
+        return Value(self._graph, self._graph.load(kind, None, _FLAG, None))
+
+    def _update(self) -> tuple[list[Store], tuple[str, ...]]:
+        """Write variables; environments that have not stepped keep theirs."""
+        written: dict[str, None] = {}
+        for update in self._formulas.updates:
+            values = self._values()
+            for name, value in update.items():
+                written[name] = None
+                if isinstance(value, Value):
+                    self._known["variables", name] = values.of(value).number
+                    continue
+                for place, one in enumerate(value):
+                    self._known["variables", name, place] = values.of(one).number
+        is_active, before = self._told("active"), _Readings(self._env, self._graph, True)
+        stores: list[Store] = []
+        for key in self._known:
+            _, name, *places = key
+            place = places[0] if places else 0
+            kept = where(is_active, self._known[key], before.variable(name, place))
+            self._known[key] = kept
+            stores.append(Store(kept.node, ("variable", name, place)))
+        return stores, tuple(written)
+
+    def _seen(self) -> list[_Seen]:
+        """The info if there is one, and the observation unless the pool makes it."""
+        env, values = self._env, self._values()
+        parts = [*_named(("info",), self._formulas.info, values)] if env.inside.has_info else []
+        if env.inside.pool_observes and not parts:
+            return []
+        space: Any = env.observation_space
+        given = self._formulas.observation
+        if not isinstance(space, spaces.Box | spaces.MultiBinary):
+            raise UntraceableError(f"programs make no observations of {space}")
+        if given is None:
+            elements = [values.output(place) for place in range(env.inside.output_count)]
+        else:
+            elements = [values.of(one) for one in given]
+        array = SeenArray(("observation",), (len(elements),), np.dtype(space.dtype))
+        return [(array, [one.cast(array.dtype) for one in elements]), *parts]
+
+
+def _named(path: tuple[str, ...], part: Computed, values: _Readings) -> Iterator[_Seen]:
+    """The values of an info, each with the names that lead to it."""
+    if isinstance(part, Mapping):
+        for name, one in part.items():
+            yield from _named((*path, name), one, values)
+        return
+    assert isinstance(part, Value)
+    value = values.of(part)
+    yield SeenArray(path, (), value.dtype), [value]
