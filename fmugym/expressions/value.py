@@ -7,6 +7,7 @@ constants is computed at once. Its operations are those of programs, see
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Final
 
@@ -19,18 +20,16 @@ from fmugym.expressions.program import operation_of
 
 __all__ = ["Computed", "Value", "where"]
 
-_MOST_NODES: Final = 100_000
-"""A forecast of 2000 values with errors that grow and last, normalized, takes some 80,000."""
+_MOST_NODES: Final = 150_000
+"""A forecast of 2000 values with errors that grow and last, normalized, takes some 110,000."""
 
 _DOUBLE: Final = np.dtype(np.float64)
+_INTEGER: Final = np.dtype(np.int64)
+_FLAG: Final = np.dtype(np.bool_)
 
 
 def _operator(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
-    def apply(own: Value, other: Any) -> Value:
-        value: Value = ufunc(own, other)
-        return value
-
-    return apply
+    return lambda own, other: own.applied(ufunc, own, other)
 
 
 class Value:
@@ -85,7 +84,7 @@ class Value:
     @property
     def is_flag(self) -> bool:
         """Whether it is a condition, not a number."""
-        return self.dtype == np.bool_
+        return self.dtype is _FLAG
 
     @property
     def constant(self) -> float | bool | None:
@@ -100,6 +99,8 @@ class Value:
 
     def cast(self, dtype: npt.DTypeLike) -> Value:
         """The value in another type."""
+        if self.dtype is dtype:
+            return self
         return Value(self.graph, self.graph.cast(self.cell, np.dtype(dtype)))
 
     def taken(self, table: Hashable) -> Value:
@@ -133,24 +134,38 @@ class Value:
     def __array_ufunc__(self, ufunc: Any, method: str, *operands: Any, **keywords: Any) -> Any:
         if method != "__call__" or keywords:
             return NotImplemented
+        return self.applied(ufunc, *operands)
+
+    def applied(self, ufunc: np.ufunc, *operands: Any) -> Value:
+        """The value of a function of numpy, of values and numbers."""
         values = [self.beside(one) for one in operands]
-        if all(one.is_flag for one in values) and operation_of(ufunc, "?") is None:
-            values = [one.cast(np.int64) for one in values]
-        *types, dtype = ufunc.resolve_dtypes((*(one.dtype for one in values), None))
+        types, dtype = _loop_of(ufunc, tuple([one.dtype for one in values]))
         cast = [one.cast(wanted) for one, wanted in zip(values, types, strict=True)]
         if ufunc in _MADE_OF:
             return _MADE_OF[ufunc](*cast)
-        return Value(self.graph, self.graph.apply(ufunc, tuple(v.cell for v in cast), dtype))
+        cells = tuple([one.cell for one in cast])
+        return Value(self.graph, self.graph.compute("ufunc", ufunc, cells, dtype, ufunc))
 
     def beside(self, operand: Any) -> Value:
         """A value or a number as a value of the same graph."""
         return operand if isinstance(operand, Value) else Value.of(self.graph, operand)
 
 
+@functools.cache
+def _loop_of(
+    ufunc: np.ufunc, dtypes: tuple[np.dtype[Any], ...]
+) -> tuple[tuple[np.dtype[Any], ...], np.dtype[Any]]:
+    """The types that a function takes for operands of some types, and that of its value."""
+    if set(dtypes) == {_FLAG} and operation_of(ufunc, "?") is None:
+        dtypes = (_INTEGER,) * len(dtypes)
+    *types, dtype = ufunc.resolve_dtypes((*dtypes, None))
+    return tuple(types), dtype
+
+
 def _type_of(number: float | bool) -> np.dtype[Any]:
     if isinstance(number, bool | np.bool_):
-        return np.dtype(np.bool_)
-    return np.dtype(np.int64) if isinstance(number, int | np.integer) else _DOUBLE
+        return _FLAG
+    return _INTEGER if isinstance(number, int | np.integer) else _DOUBLE
 
 
 def where(condition: Value, first: Value | float, second: Value | float) -> Value:

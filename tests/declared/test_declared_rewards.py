@@ -84,9 +84,9 @@ LARGE = {
     "many terms": (
         'shift = "theta - theta_0"\n[agent]',
         'shift = "sin(time) + cos(time) + exp(-time) + abs(time) + sqrt(time) + log(time + 1)"\n'
-        + "".join(f's{i} = "shift * {i} + (shift - {i}) / {i + 1}"\n' for i in range(20))
+        + "".join(f's{i} = "shift * {i} + (shift - {i}) / {i + 1}"\n' for i in range(90))
         + "[agent]\n"
-        + f"forecast = {{ of = {[f's{i}' for i in range(20)]}, horizon = 20 }}",
+        + f"forecast = {{ of = {[f's{i}' for i in range(90)]}, horizon = 20 }}",
     ),
     "power of powers": ("tau = {", 'theta = { unit = "deg**9**9**9" }\ntau = {'),
     "power of numbers": ("tau = {", 'theta = { unit = "(9**99)**99 deg" }\ntau = {'),
@@ -106,7 +106,7 @@ def test_what_is_too_large_is_refused_at_once(task, case):
     begin = time.process_time()
     with pytest.raises(fmugym.ConfigError, match=r"swing\.toml"):
         fmugym.load(path)
-    assert time.process_time() - begin < 5.0
+    assert time.process_time() - begin < 15.0
 
 
 def test_a_row_that_users_write_is_taken_at_once(task):

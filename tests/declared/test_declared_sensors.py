@@ -8,8 +8,8 @@ from combinations import in_turn
 from vector_tools import require_same_alone
 
 import fmugym
-from fmugym.declared import mathematics
 from fmugym.errors import TaskError
+from fmugym.expressions import mathematics
 
 DT = 0.05
 DRAWN = {"q_0": {"distribution": "uniform", "low": -1, "high": 1}}
