@@ -8,6 +8,8 @@
     │   ├── UnknownParameterError
     │   │                 ``env.parameters`` has no such name; it is a ``KeyError``, too
     │   └── TaskError     a declared task has a mistake; the text says where
+    │       └── ConsequenceError
+    │                     it follows from another mistake only, which is told instead
     ├── FMULoadError      an archive, a model description or a library cannot be used
     ├── SimulationError   an FMI call failed, or a method was called out of order
     │   └── LicenceError  an FMU got no licence; it is a ``FMULoadError``, too

@@ -97,6 +97,12 @@ def _as_float32(value: Any) -> Any:
     return value.cast(np.float32).cast(np.float64)
 
 
+def _power_of_float32(base: Any, exponent: Any) -> Any:
+    """The power of two numbers that are rounded to float32, as the C function ``powf``."""
+    power = np.power(base.cast(np.float32), exponent.cast(np.float32))
+    return power.cast(np.float64)
+
+
 _OF_NUMPY: Final = (
     *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh"),
     *("exp", "expm1", "log", "log10", "log1p", "sqrt", "square", "sign", "floor", "ceil"),
@@ -112,6 +118,8 @@ FUNCTIONS: Final[dict[str, Function]] = {
     "arctan2": Function(np.arctan2, 2, 2),
     "round": Function(np.rint),
     "float32": Function(_as_float32),
+    "pow": Function(np.float_power, 2, 2),
+    "powf": Function(_power_of_float32, 2, 2),
     **{name: Function(getattr(np, name)) for name in _OF_NUMPY},
 }
 """The functions by the names that they have in expressions."""
