@@ -7,7 +7,7 @@ thermostat that leaves the battery alone is the measure.
     pip install '.[examples]' pythonfmu
     python examples/train_system.py --folder results
 
-writes the FMUs, a picture of the system, and the learning curve.
+writes the FMUs and the learning curve.
 """
 
 import argparse
@@ -212,7 +212,6 @@ def main(argv=None):
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(argv)
     system = make_system(options.folder)
-    system.plot(options.folder / "home.svg")
     envs = fmugym.FMUVectorEnv(lambda: HomeEnv(system), options.envs, autoreset_mode="Disabled")
     reference = float(np.mean(thermostat(envs, TEST_SEED)))
     curve, policy = [], np.zeros((6, 2))

@@ -159,11 +159,6 @@ class TestRefusals:
             (lambda path: exchange_tools.exchange_fmu(path, "ball"), ("e", "h"), "model exchange"),
             (clocks_tools.clocks_fmu, ("plain", "x"), "clocks and event mode"),
             (lambda path: values_tools.state_space_fmu(path), ("u", "y"), "arrays"),
-            (
-                lambda path: values_tools.feedthrough_fmu(path, 2),
-                ("Real_in", "Real_out", "String_out"),
-                "Strings",
-            ),
         ],
     )
     def test_of_fmus(self, tmp_path, make, names, reason):
@@ -171,7 +166,6 @@ class TestRefusals:
         config = {
             "model_input_names": names[0],
             "model_output_names": names[1],
-            "monitor_names": list(names[2:]),
             "bounds": {names[0]: (-1.0, 1.0)},
             "time_step": 0.1,
         }
