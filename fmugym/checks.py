@@ -14,12 +14,12 @@ import os
 import re
 import stat
 import unicodedata
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from numbers import Real
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ __all__ = [
     "LARGEST_COUNT",
     "KnownArguments",
     "Spellings",
+    "by_own_names",
     "check_count",
     "check_dict",
     "check_flag",
@@ -50,6 +51,8 @@ __all__ = [
     "parts_of_array",
     "require_regular",
 ]
+
+_Value = TypeVar("_Value")
 
 LARGEST_COUNT: Final = 2**31 - 1
 """The largest number of steps or threads that can be asked for."""
@@ -350,19 +353,54 @@ class Spellings:
         Raises:
             ConfigError: If it may be several. The text tells their letters by numbers.
         """
-        if not isinstance(name, str) or name in self._names:
-            return name if isinstance(name, str) else None
-        normal = normal_form(name)
+        if not isinstance(name, str):
+            return None
+        plain = str.__str__(name)  # a subclass may have odd methods
+        if plain in self._names:
+            return plain
+        normal = normal_form(plain)
         found = [*self._others.get(normal, ())]
         if normal in self._names and normal not in found:
             found.append(normal)
         if len(found) > 1:
             told = ", ".join(map(ascii, found))
             raise ConfigError(
-                f"{self._kind} {name!a} may be any of {told}, which only look the same; write "
+                f"{self._kind} {plain!a} may be any of {told}, which only look the same; write "
                 "one of them exactly"
             )
         return found[0] if found else None
+
+    def require(self, name: Any) -> str:
+        """The name that is meant.
+
+        Raises:
+            ConfigError: If there is none, with the nearest name; or as ``find``.
+        """
+        found = self.find(name)
+        if found is None:
+            raise unknown_name(self._kind, name, self._names)
+        return found
+
+
+def by_own_names(
+    what: str, given: Mapping[str, _Value], own_name: Callable[[str], str]
+) -> dict[str, _Value]:
+    """What is given by names, by the own names of what these stand for.
+
+    Args:
+        what: What is given, for the error.
+        given: Values by name.
+        own_name: Finds the own name for a given one.
+
+    Raises:
+        ConfigError: If two names stand for the same, which may look the same, too.
+    """
+    names: dict[str, str] = {}
+    for name in given:
+        first = names.setdefault(own_name(name), name)
+        if first != name:
+            raise ConfigError(f"{what}: {first!a} and {name!a} are one name; leave one of both out")
+    return {own: given[name] for own, name in names.items()}
 
 
 def normal_form(name: str) -> str:

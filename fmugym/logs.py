@@ -17,6 +17,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +28,7 @@ from gymnasium import spaces
 
 from fmugym.archive.units import Conversion, conversion_of
 from fmugym.archive.variable import Variable
-from fmugym.checks import Spellings, check_number
+from fmugym.checks import Spellings, by_own_names, check_number, normal_form
 from fmugym.declared import Task
 from fmugym.declared.data_files import read_tables
 from fmugym.declared.data_rows import usual_distance
@@ -70,6 +71,8 @@ _MOST_ACTIONS: Final = 10_000
 class PlantLog:
     """What a plant has measured.
 
+    Columns are also found by names whose letters only look other; see ``find``.
+
     Attributes:
         times: In seconds, rising within an episode, shape (n,).
         columns: The values by name, each of shape (n,).
@@ -77,6 +80,9 @@ class PlantLog:
         episodes: Numbers of the episodes, shape (n,).
         inputs_before: Whether inputs in a row are those that led to it, from the row before;
             otherwise they hold until the next row.
+
+    Raises:
+        ConfigError: If the names of two columns look the same.
     """
 
     times: FloatArray
@@ -84,6 +90,9 @@ class PlantLog:
     units: Mapping[str, str]
     episodes: FloatArray
     inputs_before: bool = False
+
+    def __post_init__(self) -> None:
+        by_own_names("the columns of the log", self.columns, normal_form)
 
     @classmethod
     def read(
@@ -110,8 +119,8 @@ class PlantLog:
                 are; by default the smallest offset of the dates.
 
         Raises:
-            ConfigError: If the file cannot be read, a cell that is needed is no number, or times do
-                not rise.
+            ConfigError: If the file cannot be read, two columns have the same name, a cell that is
+                needed is no number, or times do not rise.
         """
         zone = None if timezone is None else zone_of("timezone", timezone)
         columns, units = _columns(path)
@@ -121,10 +130,11 @@ class PlantLog:
         del columns[time.name]
         values = {name: one.numbers for name, one in columns.items() if one.is_numeric}
         times, is_known = _times(time, zone, standard)
-        numbers = values.pop("episode", None)
-        numbers = _episodes(times, is_known) if numbers is None else numbers[is_known]
+        known = Spellings("column of the log", values)
+        episode, step = known.find("episode"), known.find("step")
+        numbers = _episodes(times, is_known) if episode is None else values.pop(episode)[is_known]
         _require_rising(time, np.flatnonzero(is_known), times, numbers)
-        before = "step" in values if inputs_before is None else inputs_before
+        before = step is not None if inputs_before is None else inputs_before
         values = {name: one[is_known] for name, one in values.items()}
         units = {name: unit for name, unit in units.items() if name in values}
         return cls(times, values, units, numbers.astype(np.float64), before)
@@ -135,19 +145,31 @@ class PlantLog:
         given = {
             acted: np.where(np.isnan(values), self.columns[acted], values)
             for name, values in self.columns.items()
-            if (acted := name.removeprefix(_PROPOSED)) != name and acted in self.columns
+            if (plain := normal_form(name)).startswith(_PROPOSED)
+            if (acted := self.find(plain.removeprefix(_PROPOSED))) is not None
         }
         return replace(self, columns={**self.columns, **given}) if given else None
+
+    def find(self, name: str) -> str | None:
+        """The name of a column in the log, also by letters that look the same; None if none is."""
+        return self._spellings.find(name)
+
+    @cached_property
+    def _spellings(self) -> Spellings:
+        return Spellings("column of the log", self.columns)
 
     def parts(self, needed: Sequence[str] = ()) -> Iterator[PlantLog]:
         """The episodes, one by one.
 
         Args:
             needed: The columns without which a row is none: an episode ends before it.
+
+        Raises:
+            ConfigError: If there is no such column.
         """
         lacks = np.zeros(len(self.times), np.bool_)
         for name in needed:
-            lacks |= np.isnan(self.columns[name])
+            lacks |= np.isnan(self.columns[self._spellings.require(name)])
         is_new = (np.diff(self.episodes) != 0.0) | (np.diff(lacks) != 0)
         ends = np.flatnonzero(is_new) + 1
         for rows in np.split(np.arange(len(self.times)), ends):
@@ -177,11 +199,16 @@ def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, Column], dict[str,
         (table,) = read_tables(Path(path)).values()
     columns: dict[str, Column] = {}
     units: dict[str, str] = {}
-    for column in table.columns:
+    numbers: dict[str, int] = {}
+    for number, column in enumerate(table.columns, 1):
         name, unit = _heading(column.name)
-        if name in columns:
-            raise ConfigError(f"{shown(str(path))} has two columns {shown(name)}")
         if name or not column.is_numeric:
+            first = numbers.setdefault(normal_form(name), number)
+            if first != number:
+                raise ConfigError(
+                    f"{shown(str(path))} has two columns {shown(name)}: number {first}, "
+                    f"{table.names[first - 1]!a}, and number {number}, {column.name!a}"
+                )
             columns[name] = replace(column, name=name)
         if unit:
             units[name] = unit
@@ -366,15 +393,19 @@ def as_logged(task: Task, log: PlantLog) -> Task:
     task = on_time_of_year(task, Uniform(0.0, YEAR))
     root = task.root
     entries, standard = root.child("data").items().items(), standard_time(root).offset
-    data = {n: _as_logged(entry, log, n, standard) for n, entry in entries if n in log.columns}
+    data = {
+        name: _as_logged(entry, log, column, standard)
+        for name, entry in entries
+        if (column := log.find(name)) is not None
+    }
     own = task.document.get("data", {})
     return replace(task, document={**task.document, "data": {**own, **data}}) if data else task
 
 
-def _as_logged(entry: Entry, log: PlantLog, name: str, standard: int | None) -> dict[str, Any]:
+def _as_logged(entry: Entry, log: PlantLog, column: str, standard: int | None) -> dict[str, Any]:
     """Data with the values of a log while there are some, and their own at other times."""
-    series, known = read_data(entry, standard), ~np.isnan(log.columns[name])
-    times, values = log.times[known], log.columns[name][known]
+    series, known = read_data(entry, standard), ~np.isnan(log.columns[column])
+    times, values = log.times[known], log.columns[column][known]
     if series.period == YEAR and len(times):
         own = series.start + series.times
         others = (own - times[0]) % YEAR > np.ptp(times)
@@ -406,7 +437,8 @@ class Columns:
     """The columns of a log as variables of an FMU, in the units of the FMU."""
 
     def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:
-        self._columns, self._data = log.columns, _section(env, "data")
+        self._columns, self._data = log.columns, Spellings("data", _section(env, "data"))
+        columns = by_own_names("columns", columns, lambda name: log.find(name) or name)
         self._variables = env.fmu.description.variables
         self._from: dict[str, tuple[str, Conversion]] = {}
         for column in log.columns:
@@ -455,7 +487,7 @@ class Columns:
         Data of the task have those of the row's time in any log.
         """
         values, column = self.values(variable, part), self._from[variable.name][0]
-        if not part.inputs_before or column in self._data:
+        if not part.inputs_before or self._data.find(column) is not None:
             return values
         return np.append(values[1:], values[-1])
 

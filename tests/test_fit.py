@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from fit_coverage import fitted, house_log
+from letters import GREEK, MICRO, wide, with_names, with_wide_names
 from test_identification import TRUE, swing
 
 import fmugym
@@ -126,6 +127,28 @@ class TestPendulum:
         first, second = json.loads(out)["start_values"]
         assert first == pytest.approx(second)
 
+    @pytest.mark.parametrize(("own", "given"), [(MICRO, GREEK), (GREEK, MICRO)])
+    def test_names_are_found_by_letters_that_look_the_same(self, ran, tmp_path, own, given):
+        with_names(tmp_path, q=f"q{own}", q_0=f"q_0{own}", l=f"l{own}", tau=f"tau{own}")
+        task = fmugym.Task.from_dict(
+            tomllib.loads(TASK)
+            | {
+                "fmu": str(tmp_path / "model.fmu"),
+                "reward": f"-angle{own} ** 2",
+                "variables": {f"angle{own}": {"name": f"q{own}", "unit": "deg"}},
+                "agent": {"actions": [f"tau{own}"], "observations": [f"angle{own}"]},
+            }
+        )
+        task.write(tmp_path / "task.toml")
+        log = write_log(tmp_path / "log.csv", f"time,pos{given} [deg],tau{given}")
+        options = "--parameter", f"l{given}=0.05..0.2", "--start", f"q_0{given}=angle{given}"
+        renaming = "--column", f"pos{own}=angle{given}"
+        file = tmp_path / "task.toml"
+        found = json.loads(ran("fit", file, "--log", log, *options, *renaming, "--json"))
+        low, high = found["parameters"][f"l{own}"]["interval"]
+        assert low < TRUE["l"] < high
+        assert found["start_values"][0][f"q_0{own}"] == pytest.approx(2.0, abs=0.005)
+
     def test_an_episode_ends_where_nothing_was_measured(self, ran, task, tmp_path):
         def with_a_gap(rows):
             return np.where(np.arange(len(rows))[:, None] == 20, [1.0, np.nan, 1.0] * rows, rows)
@@ -145,6 +168,7 @@ class TestPendulum:
         [
             ("time,angle [deg],tua", None, (), "unknown column of the log 'tau'.*'tua'"),
             ("time,ange [deg],tau", None, (), "unknown column of the log 'q'"),
+            (f"time,tau,{wide('tau')}", None, (), r"two columns.*2, 'tau', and number 3, '.uff"),
             ("time,angle [kg],tau", None, (), "column 'angle' of the log.*kg"),
             (None, lambda rows: rows[:1], (), "no two rows.*angle"),
             (None, lambda rows: rows[:3], (), "2 measured values are too few for 3 values"),
@@ -210,7 +234,10 @@ class TestHouse:
         assert washed.experiment.wash_in == pytest.approx(0.4 * 86400.0)
         assert not washed.correlations["T_op"].is_noise  # the walls do not forget so soon
 
-    def test_a_recorded_episode_is_a_log(self, cli, ran, tmp_path):
+    @pytest.mark.parametrize(
+        "changed", [str, with_wide_names], ids=["own letters", "other letters"]
+    )
+    def test_a_recorded_episode_is_a_log(self, cli, ran, tmp_path, changed):
         """Its columns of data hold from their rows on, its inputs until then."""
         base, output = tmp_path / "house.toml", tmp_path / "plant.csv"
         fmugym.Task.read(fit_coverage.HOUSE_TASK).write(base)
@@ -218,6 +245,7 @@ class TestHouse:
         plant.write_text('extends = "house.toml"\nparameters = { UA = 520, T_start = 20 }\n')
         who = "--controller", "hysteresis of=T setpoint=T_set band=1", "--steps", "200"
         ran("simulate", plant, "--scenario", "frost", *who, "--output", output)
+        output.write_text(changed(output.read_text(encoding="utf-8")), encoding="utf-8")
         starts = "--start", "T_m_0", "--start", "T_w_0=T_floor"
         options = "--parameter", "UA", *starts, "--candidates", "1", "--json"
         code, out, err = cli("fit", base, "--log", output, *options)

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from letters import GREEK, MICRO, wide
 
 import fmugym
 from fmugym import ConfigError, bundled_fmu
@@ -285,3 +286,76 @@ class TestTables:
         log = PlantLog.read(tmp_path / "x.parquet")
         assert log.times.tolist() == [59 * 86400.0 + 3600 * k for k in range(3)]
         np.testing.assert_array_equal(log.columns["x"], [1, np.nan, 3])
+
+
+class TestLetters:
+    """Columns are found by names whose letters only look the same."""
+
+    ROWS = ("0,0,0,0", "0.02,0,0,3", "0.04,0,0,4")
+
+    def text(self, heading):
+        return "\n".join([heading, *self.ROWS])
+
+    def test_variables(self, tmp_path):
+        log = log_of(tmp_path, self.text(f"{wide('time,x,x_dot')} [m/s],{wide('f')}"))
+        (one,) = play_log(log, Cart)
+        np.testing.assert_allclose(one.actions.ravel(), [0, 0.3], rtol=1e-6)
+
+    @pytest.mark.parametrize(("written", "given"), [(MICRO, GREEK), (GREEK, MICRO)])
+    def test_columns_of_other_names(self, tmp_path, written, given):
+        log = log_of(tmp_path, self.text(f"time,x,x_dot,{written}"))
+        (one,) = play_log(log, Cart, columns={given: wide("f")})
+        np.testing.assert_allclose(one.actions.ravel(), [0, 0.3], rtol=1e-6)
+        with pytest.raises(ConfigError) as caught:
+            play_log(log, Cart, columns={MICRO: "f", GREEK: "x"})
+        assert all(ascii(name) in str(caught.value) for name in (MICRO, GREEK))
+
+    def test_steps_and_episodes(self, tmp_path):
+        rows = ["0,0,0,0,0,0", "0.02,0,0,3,0,1", "0.04,0,0,4,1,0", "0.06,0,0,5,1,1"]
+        heading = f"time,x,x_dot,f,{wide('episode')},{wide('step')}"
+        log = log_of(tmp_path, "\n".join([heading, *rows]))
+        assert log.inputs_before
+        actions = [one.actions.ravel().tolist() for one in play_log(log, Cart)]
+        np.testing.assert_allclose(actions, [[0.3], [0.5]], rtol=1e-6)
+
+    def test_what_was_proposed(self, tmp_path):
+        rows = ["0,1,", "1,2,5"]
+        log = log_of(tmp_path, "\n".join([f"time,{MICRO},proposed.{GREEK}", *rows])).proposed
+        assert log.columns[MICRO].tolist() == [1, 5]
+
+    @pytest.mark.parametrize(("declared", "logged"), [(MICRO, GREEK), (GREEK, MICRO)])
+    def test_data_of_a_task(self, tmp_path, declared, logged):
+        """The rows of a column of data have their own time, and the data its values."""
+        config = {
+            "fmu": {"bundled": "CartPole"},
+            "time_step": 0.02,
+            "clock": "0s",
+            "data": {declared: {"values": [1.0, 2.0], "step": "1h", "input": "f"}},
+            "agent": {"actions": [], "observations": ["x", declared]},
+            "reward": "x",
+        }
+        task = fmugym.Task.from_dict(config)
+        rows = ["time,step,x," + logged, "0,0,0,7", "0.02,1,0,8", "0.04,2,0,9"]
+        log = log_of(tmp_path, "\n".join(rows))
+        series = read_data(as_logged(task, log).root.child("data").child(declared))
+        assert series.values[:3].tolist() == [7, 8, 9]
+
+    def test_names_that_look_the_same_are_refused(self, tmp_path):
+        with pytest.raises(ConfigError) as caught:
+            log_of(tmp_path, self.text(f"time,x,{MICRO} [m],{GREEK} [cm]"))
+        facts = "log.csv", "number 3", ascii(f"{MICRO} [m]"), "number 4", ascii(f"{GREEK} [cm]")
+        assert all(fact in str(caught.value) for fact in facts)
+        with pytest.raises(ConfigError) as caught:
+            PlantLog(np.zeros(1), dict.fromkeys([MICRO, GREEK], np.zeros(1)), {}, np.zeros(1))
+        assert all(ascii(name) in str(caught.value) for name in (MICRO, GREEK))
+        with pytest.raises(ConfigError, match="time"):
+            log_of(tmp_path, f"time,{wide('time')}\n0,1\n1,2\n")
+
+    def test_a_misspelt_name_is_told(self, tmp_path):
+        log = log_of(tmp_path, self.text(wide("time,x,x_dt,f")))
+        with pytest.raises(ConfigError, match="unknown column of the log 'x_dot'") as caught:
+            play_log(log, Cart)
+        assert wide("x_dt") in str(caught.value)
+        assert len([*log.parts(["x"])]) == 1
+        with pytest.raises(ConfigError, match="unknown column of the log 'xx'"):
+            next(log.parts(["xx"]))

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import Spellings, check_integer
+from fmugym.checks import Spellings, check_integer, normal_form
 from fmugym.declared.dates import Dates, FloatArray, IntArray, shown_date, zone_of
 from fmugym.errors import ConfigError, first_of, shown, unknown_name
 
@@ -231,7 +231,7 @@ class Table:
             ConfigError: If there are several of a name.
         """
         for word in _NAMES_OF_TIME:
-            found = [column for column in self.columns if column.name.lower() == word]
+            found = [one for one in self.columns if normal_form(one.name).lower() == word]
             if len(found) > 1:
                 names = first_of([shown(column.name) for column in found])
                 raise ConfigError(f"name the column with the times as 'time': there are {names}")

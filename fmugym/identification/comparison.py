@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fmugym.checks import check_mapping, check_option, check_text
+from fmugym.checks import Spellings, by_own_names, check_mapping, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.identification.trajectory import Trajectory
 from fmugym.pool.base import FloatArray
@@ -41,9 +41,13 @@ class Comparison:
         Raises:
             ConfigError: If the output was not measured.
         """
-        output = check_option("measured output", output, self.trajectories[0].outputs)
+        own = self._measured.require(output)
         pairs = zip(self.simulated, self.trajectories, strict=True)
-        return [simulated[output] - measured.outputs[output] for simulated, measured in pairs]
+        return [simulated[own] - measured.outputs[own] for simulated, measured in pairs]
+
+    @property
+    def _measured(self) -> Spellings:
+        return Spellings("measured output", self.trajectories[0].outputs)
 
     def rms(self, output: str) -> float:
         """Return the root mean square of the residuals, in the unit of the output."""
@@ -51,7 +55,8 @@ class Comparison:
 
     def explained(self, output: str) -> float:
         """Return which part of the variance of the measured values the simulation explains."""
-        measured = np.concatenate([one.outputs[output] for one in self.trajectories])
+        own = self._measured.require(output)
+        measured = np.concatenate([one.outputs[own] for one in self.trajectories])
         return 1.0 - self.rms(output) ** 2 / (float(np.var(measured)) or 1.0)
 
 
@@ -73,7 +78,9 @@ def plot_comparison(comparison: Comparison, labels: Mapping[str, str] | None = N
     if not isinstance(comparison, Comparison):
         raise ConfigError(f"expected a Comparison, not {shown(comparison)}")
     outputs = list(comparison.trajectories[0].outputs)
-    texts = {} if labels is None else check_mapping("labels", labels)
+    measured = Spellings("measured output", outputs)
+    given = {} if labels is None else check_mapping("labels", labels)
+    texts = by_own_names("labels", given, lambda name: measured.find(name) or name)
     figure = Figure(figsize=(8, 1 + 2 * len(outputs)), layout="constrained")
     axes = figure.subplots(len(outputs), sharex=True, squeeze=False)[:, 0]
     for ax, output in zip(axes, outputs, strict=True):

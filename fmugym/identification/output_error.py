@@ -10,7 +10,7 @@ standard error tells what that does to the values.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 
 from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.checks import (
+    by_own_names,
     check_integer,
     check_mapping,
     check_number,
@@ -31,7 +32,7 @@ from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Limits, Problem
 from fmugym.identification.simulator import Experiment
 from fmugym.identification.statistics import Correlation
-from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.identification.trajectory import Trajectory, named_as_own
 from fmugym.pool.base import FloatArray
 
 __all__ = ["FitResult", "fit_of", "fit_parameters"]
@@ -204,9 +205,9 @@ class FitResult:
         self, trajectories: Sequence[Trajectory]
     ) -> tuple[Experiment, list[Trajectory]]:
         """Fix the fitted values, and add fitted constants to the logged inputs."""
-        common_names(trajectories)
-        description = self.experiment.fmu.description
-        offsets = {n for n in self.values if description.variable(n).causality == "input"}
+        fmu = self.experiment.fmu
+        trajectories = named_as_own(trajectories, _own_name_in(fmu))
+        offsets = {n for n in self.values if fmu.variable(n).causality == "input"}
         fixed = {n: v for n, v in self.values.items() if n not in offsets}
         experiment = replace(self.experiment, fixed={**self.experiment.fixed, **fixed})
         return experiment, [_shifted(t, {n: self.values[n] for n in offsets}) for t in trajectories]
@@ -263,20 +264,28 @@ def fit_parameters(
     wanted = check_mapping("parameters", parameters)
     if not wanted:
         raise ConfigError("there is no parameter to fit")
+    opened = FMU.of(fmu)
+    own_name = _own_name_in(opened)
     experiment = Experiment(
-        FMU.of(fmu),
-        _mapping("initial_states", initial_states),
-        _mapping("fixed", fixed),
+        opened,
+        by_own_names("initial_states", _mapping("initial_states", initial_states), own_name),
+        by_own_names("fixed", _mapping("fixed", fixed), own_name),
         _mapping("scales", scales),
         time_step,
         drop_repeats=True,
         wash_in=wash_in,
     )
-    return fit_of(experiment, wanted, trajectories, candidates)
+    wanted = by_own_names("parameters", wanted, own_name)
+    return fit_of(experiment, wanted, named_as_own(trajectories, own_name), candidates)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
     return {} if value is None else check_mapping(what, value)
+
+
+def _own_name_in(fmu: FMU) -> Callable[[str], str]:
+    """A function that finds the own name of a variable, also by letters that look the same."""
+    return lambda name: fmu.variable(name).name
 
 
 def fit_of(

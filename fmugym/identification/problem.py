@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number, check_option, float_or_nan
-from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan
+from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.simulator import Experiment, Simulator
@@ -124,8 +124,10 @@ class Problem:
         self._rows = range(len(names))
         variables = [_settable(experiment, name) for name in names]
         self._set_limits(variables, parameters)
-        self._scales = _scales(experiment.scales, self.trajectories, outputs)
-        self._given = [name in experiment.scales for name in outputs]
+        measured = Spellings("measured output", outputs)
+        scales = by_own_names("scales", experiment.scales, measured.require)
+        self._scales = _scales(scales, self.trajectories, outputs)
+        self._given = [name in scales for name in outputs]
         self._last = np.empty(0), self._states
         count = 1 + len(self._rows)
         self._simulator = Simulator(experiment, self.trajectories, variables, count)
@@ -426,10 +428,11 @@ def _measured_states(
 ) -> FloatArray:
     """Return the initial states from the first samples or from numbers, shape (states, W)."""
     states = np.empty((len(initial_states), len(trajectories)))
+    measured = Spellings("measured output", trajectories[0].outputs)
     for k, (name, source) in enumerate(initial_states.items()):
         if isinstance(source, str):
-            source = check_option("measured output", source, trajectories[0].outputs)
-            states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
+            own = measured.require(source)
+            states[k] = [trajectory.outputs[own][0] for trajectory in trajectories]
         else:
             states[k] = check_number(f"the initial state {shown(name)}", source)
     return states
@@ -440,8 +443,6 @@ def _scales(
 ) -> FloatArray:
     """Return the scale of each output, shape (outputs,)."""
     for name, scale in given.items():
-        if name not in outputs:
-            raise unknown_name("measured output", name, outputs)
         check_number(f"the scale of {name!r}", scale, positive=True)
     spread = {
         n: float(np.std(np.concatenate([t.outputs[n] for t in trajectories]))) for n in outputs

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_mapping, check_text
+from fmugym.checks import by_own_names, check_mapping, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 
-__all__ = ["Trajectory", "common_names"]
+__all__ = ["Trajectory", "common_names", "named_as_own"]
 
 LONGEST_REPEAT = 5
 """Longer runs of equal samples are a plant at rest, not stale samples."""
@@ -89,16 +89,44 @@ def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[st
     Raises:
         ConfigError: If something is not a trajectory, there is none, or the names differ.
     """
-    is_list = isinstance(trajectories, Sequence)
-    if not (is_list and all(isinstance(one, Trajectory) for one in trajectories)):
-        raise ConfigError(f"expected a list of trajectories, not {shown(trajectories)}")
-    if not trajectories:
-        raise ConfigError("expected at least one trajectory")
+    _require_trajectories(trajectories)
     outputs, inputs = list(trajectories[0].outputs), list(trajectories[0].inputs)
     for other in trajectories:
         if set(other.outputs) != set(outputs) or set(other.inputs) != set(inputs):
             raise ConfigError("all trajectories must have the same outputs and the same inputs")
     return outputs, inputs
+
+
+def named_as_own(
+    trajectories: Sequence[Trajectory], own_name: Callable[[str], str]
+) -> list[Trajectory]:
+    """Return the trajectories with the own names of the FMU's variables.
+
+    Args:
+        trajectories: They may have names whose letters only look the same.
+        own_name: Finds the own name for a given one.
+
+    Raises:
+        ConfigError: If something is not a trajectory, there is none, or two names of a trajectory
+            stand for the same variable.
+    """
+    _require_trajectories(trajectories)
+    return [
+        replace(
+            one,
+            outputs=by_own_names("the outputs of a trajectory", one.outputs, own_name),
+            inputs=by_own_names("the inputs of a trajectory", one.inputs, own_name),
+        )
+        for one in trajectories
+    ]
+
+
+def _require_trajectories(trajectories: Any) -> None:
+    is_list = isinstance(trajectories, Sequence)
+    if not (is_list and all(isinstance(one, Trajectory) for one in trajectories)):
+        raise ConfigError(f"expected a list of trajectories, not {shown(trajectories)}")
+    if not trajectories:
+        raise ConfigError("expected at least one trajectory")
 
 
 def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:

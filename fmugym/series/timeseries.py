@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_path
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.checks import Spellings, check_path
+from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
 from fmugym.series.store import FAULT, WHOLE, open_store
@@ -46,9 +46,7 @@ class TimeSeries:
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         """The values of a column, shape (rows,)."""
         names = [column.name for column in self.columns]
-        if name not in names:
-            raise unknown_name("column", name, names)
-        return self.values[:, names.index(name)]
+        return self.values[:, names.index(Spellings("column", names).require(name))]
 
     def cells(self) -> list[npt.NDArray[Any]]:
         """The values of each column in their own type."""

@@ -185,10 +185,7 @@ class EpisodeVariables(dict[str, Any]):
 
     def _spelt(self, name: Any) -> str:
         """The own name that is meant, also by other letters that look the same."""
-        spelt = Spellings("episode variable", self.keys()).find(name)
-        if spelt is None:
-            raise unknown_name("episode variable", name, self)
-        return spelt
+        return Spellings("episode variable", self.keys()).require(name)
 
     def __setitem__(self, name: str, value: Any) -> None:
         is_own = isinstance(name, str) and name in self

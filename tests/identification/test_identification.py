@@ -11,9 +11,11 @@ import pytest
 import values_tools
 from example_tools import run_example
 from fmu_tools import PlainEnv
+from letters import wide
 from scipy.integrate import solve_ivp
 
 import fmugym
+from fmugym import ConfigError
 from fmugym.identification import Trajectory, fit_parameters, plot_comparison
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")
@@ -90,6 +92,44 @@ class TestOutputError:
             intervals = fit.confidence_intervals(0.8)
             count += sum(low <= TRUE[name] <= high for name, (low, high) in intervals.items())
         assert 39 <= count <= 57
+
+    def test_names_are_found_by_letters_that_look_the_same(self):
+        first, second = noisy(2, 2.0, -1.0, end=1.0, step=0.01)
+        first, third = (
+            Trajectory(one.time, {wide(n): one.outputs[n] for n in one.outputs}, {wide("tau"): 0.0})
+            for one in (first, second)
+        )
+        fit = fit_parameters(
+            PENDULUM,
+            {wide("l"): 0.12, wide("tau"): (0.0, -0.1, 0.1)},
+            [first, second],
+            initial_states={wide(name): wide(output) for name, output in START.items()},
+            fixed={wide("c"): 2e-3},
+            scales={wide("q"): 0.01, wide("q_dot"): 0.1},
+        )
+        assert fit.values["l"] == pytest.approx(TRUE["l"], rel=0.01)
+        assert [*fit.values] == ["l", "tau"]
+        assert [*fit.comparison.initial_values[0]] == [*START]
+        predicted = fit.predict([third])
+        assert predicted.rms(wide("q")) == predicted.rms("q") == pytest.approx(0.01, rel=0.3)
+        assert predicted.explained(wide("q")) == predicted.explained("q")
+        axes = plot_comparison(predicted, {wide("q"): "angle"}).axes
+        assert axes[0].get_ylabel() == "angle"
+        with pytest.raises(ConfigError, match="unknown measured output"):
+            predicted.rms(wide("qq"))
+
+    @pytest.mark.parametrize("what", ["parameters", "fixed", "initial_states", "scales"])
+    def test_names_that_look_the_same_are_refused(self, what):
+        name = "q" if what == "scales" else "l"
+        arguments = {"parameters": {"b": 1e-3}, what: dict.fromkeys((name, wide(name)), 1.0)}
+        with pytest.raises(ConfigError, match=f"^{what}: '{name}' and .* one name"):
+            fit_parameters(PENDULUM, trajectories=noisy(2, 2.0, end=0.1), **arguments)
+
+    def test_signals_that_look_the_same_are_refused(self):
+        (one,) = noisy(2, 2.0, end=0.1)
+        odd = Trajectory(one.time, {"q": one.outputs["q"], wide("q"): one.outputs["q"]})
+        with pytest.raises(ConfigError, match=r"outputs of a trajectory: 'q' and .* one name"):
+            fit_parameters(PENDULUM, {"l": 0.12}, [odd])
 
     def test_sampling_times_may_be_any(self):
         (full,) = noisy(3, 2.0, step=0.001)

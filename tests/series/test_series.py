@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 import pytest
 from combinations import in_turn
+from letters import wide
 
 import fmugym
 from fmugym import ConfigError
@@ -156,6 +157,13 @@ class TestSingle:
         assert names[2:8] == ["time", "f", "x", "x_dot", "phi", "phi_dot"]
         assert env.series["phi"].astype(np.float32).tolist() == [r[0][2] for r in results]
         assert env.series.units["phi"] == "rad"
+
+    def test_columns_are_found_by_letters_that_look_the_same(self, record):
+        env = record()
+        played(env, 0, 3)
+        assert env.series[wide("angle")].tolist() == env.series["angle"].tolist()
+        with pytest.raises(ConfigError, match="unknown column"):
+            env.series[wide("angel")]
 
     def test_at_a_rate_sums_stay_right(self, record):
         whole, part = record(), record(every=0.25)
