@@ -12,12 +12,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_path
+from fmugym.checks import Spellings, check_path
 from fmugym.declared.data_files import read_tables
 from fmugym.declared.data_tables import Column, Table
 from fmugym.declared.dates import CURE, DAY, HOUR, REGULAR, Dates, FloatArray
 from fmugym.declared.entries import Entry
-from fmugym.errors import ConfigError, missing_file, shown, unknown_name
+from fmugym.errors import ConfigError, missing_file, shown
 
 __all__ = ["Rows", "offsets_of", "read_rows", "usual_distance"]
 
@@ -278,9 +278,8 @@ def _table(entry: Entry) -> Table:
         return next(iter(tables.values()))
     if name.value is None:
         raise entry.error(f"name one of the tables as 'table': {', '.join(map(repr, tables))}")
-    if name.value not in tables:
-        raise name.error(unknown_name("table", name.value, tables))
-    return tables[name.value]
+    with name.placing():
+        return tables[Spellings("table", tables).require(name.value)]
 
 
 def _read_file(file: Entry) -> Mapping[str, Table]:

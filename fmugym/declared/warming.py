@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from fmugym.checks import check_text, normal_form, number_of
+from fmugym.checks import Spellings, check_text, normal_form, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_controller
 from fmugym.declared.variables import TaskVariable
@@ -170,8 +170,10 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
     from fmugym.baselines import Constant, controller_of
 
     value = entry.value
-    if isinstance(value, str) and value in known:
-        return _controller(known[value], {})
+    with entry.placing():
+        own = Spellings("controller of the task", known).find(value)
+    if own is not None:
+        return _controller(known[own], {})
     if isinstance(value, int | float) and not isinstance(value, bool):
         with entry.placing():
             return Constant(number_of("controller", value))

@@ -12,7 +12,7 @@ import numpy as np
 
 from fmugym.baselines import controller_of
 from fmugym.baselines.controller import require_physical
-from fmugym.checks import number_of
+from fmugym.checks import Spellings, number_of
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
@@ -146,9 +146,10 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
         ConfigError: If it names no controller, or the controller does not fit the environment.
     """
     named = _named_controllers(env)
-    if named and text not in named and text.isidentifier():
+    own = Spellings("controller of the task", named).find(text)
+    if own is None and named and text.isidentifier():
         raise unknown_name("controller of the task", text, named)
-    given = named.get(text, text)
+    given = text if own is None else named[own]
     if not isinstance(given, str):
         return action_of(env, str(given))
     return policy_of_controller(controller_of(given), env)

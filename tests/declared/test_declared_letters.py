@@ -1,17 +1,17 @@
 """Names whose letters only look the same: the micro sign, ligatures, umlauts of a Mac."""
 
 import unicodedata
-import zipfile
 from contextlib import closing
 
 import numpy as np
 import pytest
+from letters import GREEK, MICRO, wide, with_names
 
 import fmugym
 from fmugym import ConfigError, TaskError
 from fmugym.checks import Spellings
+from fmugym.episodes.simulation import policy_of
 
-MICRO, GREEK = "\u00b5_r", "\u03bc_r"
 NAMES = {
     "micro": MICRO,
     "ohm": "R_\u2126",
@@ -22,23 +22,6 @@ NAMES = {
     "composed": "Gr\u00f6\u00dfe",
 }
 FORMS = ("NFC", "NFD", "NFKC", "NFKD")
-
-
-def with_names(folder, **names):
-    """The pendulum with other names of its variables."""
-    source = fmugym.bundled_fmu("Pendulum", fmi_version="2.0")
-    path = folder / "model.fmu"
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(path, "w") as new:
-        for entry in old.infolist():
-            content = old.read(entry)
-            if entry.filename == "modelDescription.xml":
-                text = content.decode()
-                for name, other in names.items():
-                    assert f'name="{name}"' in text
-                    text = text.replace(f'name="{name}"', f'name="{other}"')
-                content = text.encode()
-            new.writestr(entry, content)
-    return path
 
 
 def task(fmu, name, **changes):
@@ -199,6 +182,38 @@ def test_columns(tmp_path):
     config["data"]["d"]["column"] = f"{MICRO}\u212a"
     with pytest.raises(TaskError, match=r"data.d.column: .*look the same"):
         fmugym.load(config)
+
+
+def test_tables_of_a_file(tmp_path):
+    file = tmp_path / "tables.txt"
+    file.write_text("#1\ndouble winter(2,2)\n0 5\n9 5\ndouble summer(2,2)\n0 7\n9 7\n")
+    config = task(
+        fmugym.bundled_fmu("Pendulum"),
+        "q",
+        clock="0s",
+        data={"d": {"file": str(file), "table": wide("summer"), "column": 2}},
+        reward="d",
+    )
+    assert angle_and_reward(config)[1] == 7
+    config["data"]["d"]["table"] = wide("sumer")
+    with pytest.raises(TaskError, match=r"data.d.table: unknown table .*'summer'"):
+        fmugym.load(config)
+
+
+@pytest.mark.parametrize(("declared", "used"), [(MICRO, GREEK), (GREEK, MICRO)])
+def test_controllers_of_a_task(declared, used):
+    changes = {
+        "controllers": {declared: "hysteresis of=q setpoint=2 band=0.1"},
+        "variables": {"tau": {"min": -1, "max": 1}},
+        "warm_up": {"period": "0.1s", "controller": {"tau": used}},
+    }
+    config = task(fmugym.bundled_fmu("Pendulum"), "q", **changes)
+    with closing(fmugym.load(config, physical=True)) as env:
+        policy = policy_of(env, used)
+        policy.begin()
+        assert policy.act(env.reset(seed=0)[0]) == 1.0
+        with pytest.raises(ConfigError, match="unknown controller of the task"):
+            policy_of(env, used + "s")
 
 
 @pytest.mark.parametrize("other", [MICRO, GREEK])
