@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fmugym.baselines.arena import most_steps_of
+from fmugym.checks import Spellings
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
@@ -257,11 +258,13 @@ def _show_scores(scores: list[Score], arguments: argparse.Namespace) -> None:
 
 
 def _scenarios(arguments: argparse.Namespace) -> list[str | None]:
-    """The scenarios to play; None for the episodes of the task."""
+    """The scenarios to play, by their names in the task; None for the episodes of the task."""
     names: list[str] = arguments.scenario or []
+    known = scenarios_of(arguments.task) if names else []
     if names == ["all"]:
-        return list(scenarios_of(arguments.task)) or [None]
-    return list(dict.fromkeys(names)) or [None]
+        return list(known) or [None]
+    spellings = Spellings("scenario", known)
+    return list(dict.fromkeys(spellings.find(name) or name for name in names)) or [None]
 
 
 def add_bench(commands: Commands) -> None:

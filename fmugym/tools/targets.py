@@ -109,11 +109,11 @@ def scenarios_of(target: str) -> list[str]:
     """
     path = Path(target)
     if path.is_file() and path.suffix.lower() not in _MODELS:
-        task: Task | None = Task.read(path)
+        task: Task | None = Task.draft(path)
     else:
         with closing(maker_of(target)()) as env:
             task = getattr(env, "task", None)
-    return [] if task is None else list(task.document.get("scenarios", {}))
+    return [] if task is None else list(task.begun().child("scenarios").items())
 
 
 def _registered(

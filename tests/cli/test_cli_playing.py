@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 from fmu_tools import interrupted_after
+from letters import wide
 
 import fmugym
 from fmugym import __main__ as program
@@ -120,6 +121,25 @@ class TestEvaluate:
         assert path.read_bytes().startswith(b"\x89PNG")
         alone = cli("evaluate", "fmugym/House-v0", *both[2:], *options[:-2], "--json")[1]
         assert json.loads(alone)["scores"][1]["rewards"] == scores[3]["rewards"]
+
+    def test_scenarios_have_the_names_of_the_task(self, ran, refused):
+        options = "--steps", "2", "--episodes", "1", "--scenario"
+        given = wide("frost"), "--scenario", "frost", "--scenario", wide("spring")
+        out = ran("evaluate", "fmugym/House-v0", *options, *given, "--json")
+        assert [one["scenario"] for one in json.loads(out)["scores"]] == ["frost", "spring"]
+        for name in ("frst", wide("frst")):
+            err = refused("evaluate", "fmugym/House-v0", *options, "spring", "--scenario", name)
+            assert "unknown scenario" in err
+        assert "'frost'" in refused("evaluate", "fmugym/House-v0", *options, "frst")
+
+    def test_scenarios_do_not_hide_other_mistakes(self, tmp_path, refused):
+        task = tmp_path / "task.toml"
+        text = (
+            Path(CART_POLE).read_text().replace('"20ms"', "-0.02").replace("abs(phi)", "abs(psi)")
+        )
+        task.write_text(f'{text}\n[scenarios.late]\nstart = "1d"\nlength = "2d"\n')
+        err = refused("evaluate", task, "--scenario", "all")
+        assert all(fact in err for fact in ("time_step", "'psi'"))
 
     def test_an_interruption_keeps_the_scores_that_are_there(self, cli, monkeypatch):
         step = interrupted_after(200, fmugym.FMUEnv.step)
