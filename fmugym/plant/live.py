@@ -10,6 +10,7 @@ import numpy as np
 from fmugym.archive.units import conversion_between
 from fmugym.declared.data_rows import read_rows
 from fmugym.declared.entries import Entry
+from fmugym.declared.spelling import as_declared
 from fmugym.errors import ConfigError, shown
 from fmugym.logs import declared_as
 from fmugym.plant.tags import DATA, Plant
@@ -33,9 +34,8 @@ class Live:
 
     def __init__(self, envs: Sequence[Any], plant: Plant) -> None:
         self._envs = envs
-        root = envs[0].task.root
-        self._standard = plant.standard
-        self._entries = plant.entry.child("data").items()
+        root = as_declared(envs[0].task.root, envs[0].fmu.description)[0]
+        self._standard, self._entries = plant.standard, plant.data
         self._ahead = {name: horizon(root, name) for name in self._entries}
         for name in sorted(_seen(root)):
             if name not in self._entries:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from fmugym.declared import Task, TaskEnv
+from fmugym.declared.spelling import as_declared
 from fmugym.errors import ConfigError
 from fmugym.plant.live import forecasts, horizon
 from fmugym.plant.serving import environment
@@ -59,7 +60,8 @@ def _section(env: Any, protocol: str) -> dict[str, Any]:
 
 def _ahead(env: TaskEnv, name: str) -> dict[str, Any]:
     """How many values of data there are, so that the agent sees far enough ahead."""
-    root, own = env.task.root, env.inside.spec.time_step
+    root = as_declared(env.task.root, env.fmu.description)[0]
+    own = env.inside.spec.time_step
     steps = [one.get("step") or own for one in forecasts(root, name)]
     if not steps:
         return {}

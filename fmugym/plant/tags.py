@@ -9,7 +9,7 @@ from typing import Any
 
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between, conversion_of
 from fmugym.archive.variable import Variable
-from fmugym.checks import Spellings
+from fmugym.checks import Spellings, by_own_names
 from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
 from fmugym.declared.standard_time import standard_time
@@ -72,6 +72,7 @@ class Plant:
         entry: Where it stands.
         address: That of the server.
         tags: By name.
+        data: Where data come from while it runs, by their names in the task.
         step: The time step of the task in seconds.
         poll, stale_after, hold: In seconds.
         standard: The offset of the task's standard time in seconds east of UTC; None if nothing
@@ -81,6 +82,7 @@ class Plant:
     entry: Entry
     address: str
     tags: Mapping[str, Tag]
+    data: Mapping[str, Entry]
     step: float
     poll: float
     stale_after: float
@@ -116,22 +118,39 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
     entry, step = env.task.root.child("plant"), env.inside.spec.time_step
     if entry.value is None:
         raise env.task.root.error("the task has no [plant], which says where a plant has what")
-    tags = {tag.name: tag for tag in _tags(env, entry)}
+    data = _data(env, entry)
+    tags = {tag.name: tag for tag in _tags(env, entry, data)}
     poll = entry.value.get("poll") or step / 10
     stale = entry.value.get("stale_after") or 3 * poll
     hold = entry.value.get("hold")
     address = address or entry.value["address"]
     standard = standard_time(env.task.root).offset
-    return Plant(entry, address, tags, step, poll, stale, step if hold is None else hold, standard)
+    hold = step if hold is None else hold
+    return Plant(entry, address, tags, data, step, poll, stale, hold, standard)
 
 
-def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
+def _data(env: TaskEnv, entry: Entry) -> dict[str, Entry]:
+    """Where data come from while the plant runs, by their names in the task."""
+    spellings = Spellings("data", env.task.document.get("data", {}))
+    given = entry.child("data").items()
+
+    def own_name(name: str) -> str:
+        with given[name].placing():
+            return spellings.require(name)
+
+    with entry.child("data").placing():
+        return by_own_names("data of the plant", given, own_name)
+
+
+def _tags(env: TaskEnv, entry: Entry, data: Mapping[str, Entry]) -> Iterator[Tag]:
     inside: Any = env.inside
     known = {one.name: one for one in inside.quantities().all}
     others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
     spellings = Spellings("variable of the task", dict.fromkeys([*known, *others]))
-    for given, one in entry.child("tags").items().items():
-        name = spellings.find(given) or given
+    with entry.child("tags").placing():
+        given = entry.child("tags").items()
+        tags = by_own_names("tags", given, lambda name: spellings.find(name) or name)
+    for name, one in tags.items():
         if name in known:
             low, high = known[name].low, known[name].high
             yield _tag(env, name, one, known[name].unit, low=low, high=high, **_in_fmu(env, name))
@@ -139,11 +158,9 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
             raise one.error(unknown_name("variable of the task", name, [*known, *others]))
     if entry.child("clock").value is not None:
         yield _tag(env, "clock", entry.child("clock"), "s")
-    for name, one in entry.child("data").items().items():
-        if name not in (data := env.task.document.get("data", {})):
-            raise one.error(unknown_name("data", name, data))
+    for name, one in data.items():
         if "file" not in one.value:
-            yield _tag(env, DATA + name, one, data[name].get("unit", ""))
+            yield _tag(env, DATA + name, one, env.task.document["data"][name].get("unit", ""))
 
 
 def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:

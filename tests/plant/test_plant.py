@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("pymodbus", reason="needs pymodbus, of the extra plant")
 
+from letters import wide, with_wide_names
 from plant_tools import (
     STEP,
     Line,
@@ -382,24 +383,38 @@ class TestData:
         write(48)
         return path, write
 
-    def task(self, prices, count=3, **plant):
+    def task(self, prices, count=3, agent=SEEN, written=str, **plant):
         data = {
             "price": {"file": str(prices[0]), "column": "ct", "interpolation": "previous"},
             "T_out": {"register": 200, "count": count, "step": "2h", "unit": "K"},
         }
-        return house(agent=SEEN, data=data, stale_after="5min", hold="5min", **plant)
+        data = {written(name): one for name, one in data.items()}
+        return house(agent=agent, data=data, stale_after="5min", hold="5min", **plant)
 
     def test_is_refused_without_a_source(self, prices):
         data = {"price": self.task(prices).document["plant"]["data"]["price"]}
         with pytest.raises(ConfigError, match=r"sees 'T_out'.*\[plant.data\]"):
             connect(house(agent=SEEN, data=data))
 
+    def test_names_that_look_the_same_are_refused(self, prices):
+        task, twice = self.task(prices), [wide("T_out"), "T_out"]
+        data = task.document["plant"]["data"] | {name: {"register": 200} for name in twice}
+        tags = task.document["plant"]["tags"] | {wide("T"): {"register": 200}}
+        for key, given in (("data", data), ("tags", tags)):
+            with pytest.raises(ConfigError, match=rf"plant\.{key}: .*'T(_out)?'.* one name"):
+                connect(house(agent=SEEN, **{"data": {}, key: given}))
+        with pytest.raises(ConfigError, match=r"plant\.data\.T_uot: unknown data .*'T_out'"):
+            connect(house(agent=SEEN, data={"T_uot": {"register": 200}}))
+
     def test_is_refused_if_a_tag_does_not_reach_far_enough(self, prices):
         with pytest.raises(ConfigError, match=r"T_out.* 14400 s ahead.*got 2 and 7200"):
             connect(self.task(prices, count=2))
 
-    def test_is_what_the_agent_sees(self, shadowed, prices):
-        task = self.task(prices)
+    @pytest.mark.parametrize("written", [str, wide], ids=["own letters", "other letters"])
+    def test_is_what_the_agent_sees(self, shadowed, prices, written):
+        forecast = {**SEEN["forecast"], "of": [*map(written, SEEN["forecast"]["of"])]}
+        agent = {"observations": [*map(written, SEEN["observations"])], "forecast": forecast}
+        task = self.task(prices, agent=agent, written=written)
         year = fmugym.load(house(), physical=True)
         table = read_data(year.task.root.child("data").child("T_out"))
         year.close()
@@ -614,6 +629,11 @@ class TestCommands:
         others = "--controller", "thermostat", "--json"
         out = ran("evaluate", file, "--log", "plant.csv", *others)
         scores = {one["name"]: one for one in json.loads(out)["scores"]}
+        written = Path("plant.csv").read_text(encoding="utf-8")
+        Path("plant.csv").write_text(with_wide_names(written), encoding="utf-8")
+        out = ran("evaluate", file, "--log", "plant.csv", *others)
+        for one in json.loads(out)["scores"]:
+            assert one["rewards"] == scores[one["name"]]["rewards"]
         assert [*scores][:3] == ["plant, measured", "actions of the plant", "proposed actions"]
         assert [*scores][3:] == ["thermostat"]
         assert {tuple(one["steps"]) for one in scores.values()} == {(6,)}
@@ -643,7 +663,7 @@ class TestCommands:
         if protocol == "opcua":
             pytest.importorskip("asyncua", reason="needs asyncua, of the extra plant")
         monkeypatch.chdir(tmp_path)
-        ahead = {"of": ["price", "T_out"], "horizon": "48h", "step": "30min"}
+        ahead = {"of": [wide("price"), "T_out"], "horizon": "48h", "step": "30min"}
         task = house(agent={"forecast": ahead})
         del task.document["plant"]
         task.write(tmp_path / "house.toml")
