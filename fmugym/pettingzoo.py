@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.checks import check_mapping, check_option, check_text
+from fmugym.checks import Spellings, check_mapping, check_option, check_text
 from fmugym.declared import TaskEnv
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
@@ -260,9 +260,10 @@ def _owner(env: FMUEnv, description: SystemDescription, name: str) -> str:
     """The component of a name, or ``_ALL``."""
     if isinstance(env, TaskEnv):
         name = env.task.root.child("variables").child(name).child("name").value or name
-    if name not in description.variables:
+    variable, names = description.find(name), list(description.variables)
+    if variable is None or variable.name not in names:
         return _ALL
-    place = list(description.variables).index(name)
+    place = names.index(variable.name)
     parts = {end.part for end in description.ends[place]}
     return description.plan.components[parts.pop()].name if len(parts) == 1 else _ALL
 
@@ -271,12 +272,13 @@ def _require_one_each(agents: Mapping[str, Any], actions: Sequence[str]) -> None
     """Each action must belong to one agent."""
     if not agents:
         raise ConfigError("there must be at least one agent")
-    owners: dict[str, str] = {}
+    spellings, owners = Spellings("action", actions), dict[str, str]()
     for name, agent in agents.items():
         if not isinstance(agent, Agent):
             raise ConfigError(f"the agent {name!r} must be an Agent, got {shown(agent)}")
         for action in agent.actions:
-            other = owners.setdefault(check_text("an action", action), name)
+            own = spellings.require(check_text("an action", action))
+            other = owners.setdefault(own, name)
             if other != name:
                 raise ConfigError(f"the action {action!r} belongs to two agents: {other}, {name}")
     for action in actions:
@@ -291,24 +293,24 @@ def _part(
         raise ConfigError(f"the agent {name!r} must act on and observe something")
     places = _places("action", agent.actions, actions)
     seen = _places("observation", agent.observations, observations)
-    if agent.reward is not None:
-        _require_reward(env, agent.reward)
     return _Part(
         places,
         seen,
-        agent.reward,
+        None if agent.reward is None else _reward_of(env, agent.reward),
         _part_of(env.action_space, places),
         _part_of(env.observation_space, seen),
     )
 
 
 def _places(what: str, names: Sequence[str], known: Sequence[str]) -> list[int]:
-    return [known.index(check_option(what, name, known)) for name in names]
+    spellings = Spellings(what, known)
+    return [known.index(spellings.require(name)) for name in names]
 
 
-def _require_reward(env: FMUEnv, name: str) -> None:
+def _reward_of(env: FMUEnv, name: str) -> str:
+    """The name of a reward as the task has it."""
     rewards = env.task.root.child("reward").value if isinstance(env, TaskEnv) else None
-    check_option("reward", name, rewards if isinstance(rewards, Mapping) else ())
+    return Spellings("reward", rewards if isinstance(rewards, Mapping) else ()).require(name)
 
 
 def _part_of(space: Any, places: list[int]) -> Any:

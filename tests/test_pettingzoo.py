@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from letters import wide
 from test_systems_faces import ONE_REWARD, TASK, TWO_REWARDS, TwoHouses, two_houses
 
 import fmugym
@@ -79,6 +80,18 @@ class TestAgents:
         seen, _ = parallel.reset(seed=0)
         assert seen["both"][0] == pytest.approx(parallel.state()[2], rel=1e-6)
         assert parallel.action_space("both").high[0] == 1.0
+
+    def test_names_are_found_by_letters_that_look_the_same(self, load):
+        agents = {
+            name: Agent([*map(wide, one.actions)], [*map(wide, one.observations)], wide(one.reward))
+            for name, one in AGENTS.items()
+        }
+        plain, other = FMUParallelEnv(load(), AGENTS), FMUParallelEnv(load(), agents)
+        for env in (plain, other):
+            env.reset(seed=0)
+        assert repr(plain.step({"e": [1.0], "w": [0.0]})) == repr(
+            other.step({"e": [1.0], "w": [0.0]})
+        )
 
     @pytest.mark.parametrize(
         ("agents", "facts"),

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.variable import Variable
+from fmugym.checks import Spellings
 from fmugym.declared import TaskEnv
 from fmugym.declared.declarations import Declarations
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError
 from fmugym.export.names import identifier
 from fmugym.expressions.graph import Graph
 
@@ -42,10 +43,8 @@ def found_in(
     if not isinstance(env, TaskEnv) or seen is None:
         raise ConfigError("only what a task file observes can be given to the agent from outside")
     series = Declarations(env.task.root, env.fmu.description).series
-    found = {}
-    for name in names:
-        if name not in series:
-            raise ConfigError(unknown_name("data", name, list(series)))
+    spellings, found = Spellings("data", series), {}
+    for name in map(spellings.require, names):
         places = [i for i, text in enumerate(seen) if text.partition("[")[0] == name]
         if not places:
             raise ConfigError(f"the agent does not observe {name!r}, so that nobody need give it")

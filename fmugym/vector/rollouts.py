@@ -10,9 +10,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable, checked_value, unlisted
-from fmugym.checks import check_count, check_mapping, check_number, check_seed
+from fmugym.checks import (
+    Spellings,
+    by_own_names,
+    check_count,
+    check_mapping,
+    check_number,
+    check_seed,
+)
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.snapshot import Columns
 from fmugym.vector.action_arrays import array_of, checked_actions, is_array_space
@@ -244,9 +251,7 @@ def tables_of(env: FMUEnv, data: Any) -> dict[str, FloatArray]:
     """
     given = {} if data is None else check_mapping("'data'", data)
     lookups = {} if env.inside.future is None else env.inside.future.lookups
-    for name in given:
-        if name not in lookups:
-            raise ConfigError(unknown_name("data that hooks read", name, lookups))
+    given = by_own_names("'data'", given, Spellings("data that hooks read", lookups).require)
     return {name: lookups[name].table_of(name, rows) for name, rows in given.items()}
 
 
@@ -266,9 +271,8 @@ def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
     """
     given = {} if offsets is None else check_mapping("'offsets'", offsets)
     names = list(env.out)
+    given = by_own_names("'offsets'", given, Spellings("output in offsets", names).require)
     for name, value in given.items():
-        if name not in names:
-            raise ConfigError(unknown_name("output in offsets", name, names))
         check_number(f"the offset of {name!r}", value)
     return np.array([given.get(name, 0.0) for name in names]) if given else None
 

@@ -24,6 +24,7 @@ from export_tools import (
     network_for,
     network_with,
 )
+from letters import wide
 
 import fmugym
 from fmugym import ConfigError
@@ -335,7 +336,7 @@ class TestExternal:
     def test_takes_the_place_of_tables(self, tmp_path):
         env, names = made("House"), ["T_out", "sun", "price"]
         network = network_for(env)
-        agent = agent_of(env, network, external=names)
+        agent = agent_of(env, network, external=[names[0], *map(wide, names[1:])])
         controller = compiled(agent, tmp_path)
         assert "house_table" not in (tmp_path / "agent.c").read_text()
         plain = [one.name for one in agent.logic.measurements]

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from letters import wide
 from test_rollouts import WAYS, rows_of
 from test_snapshots import Track
 
@@ -122,13 +123,15 @@ class TestData:
             return (0.1 * observations[:, 3:4] - 1e-4 * observations[:, :1]).astype(np.float32)
 
         for actions, horizon in ((pushes(), None), (policy, STEPS)):
-            found = envs.rollout(snapshot, actions, horizon=horizon, data={"wind": (TIMES, OTHER)})
+            other = {wide("wind"): (TIMES, OTHER)}  # the same name in other letters
+            found = envs.rollout(snapshot, actions, horizon=horizon, data=other)
             assert rows_of(found) == rows_of(same.rollout(snapshot, actions, horizon=horizon))
 
     @pytest.mark.parametrize(
         ("data", "reason"),
         [
             ({"wnd": (TIMES, OWN)}, "'wind'"),
+            (dict.fromkeys(("wind", wide("wind")), (TIMES, OWN)), "'data': 'wind' and .* one name"),
             ({"wind": OWN}, "times and values of 'wind'"),
             ({"wind": (TIMES, OWN[1:])}, "times and values of 'wind'"),
             ({"wind": ([], [])}, "times and values of 'wind'"),
@@ -156,7 +159,7 @@ class TestOffsets:
         snapshot, *_ = root(spinning())
         envs = environments(spinning(), way)
         plain = envs.rollout(snapshot, pushes())
-        found = envs.rollout(snapshot, pushes(), offsets={"q_dot": 2.5})
+        found = envs.rollout(snapshot, pushes(), offsets={wide("q_dot"): 2.5})
         assert found.rewards == pytest.approx(plain.rewards + 2.5 - 0.25, abs=1e-12)
         shift = found.observations - plain.observations
         assert shift[..., 0] == pytest.approx(np.full((N, STEPS), 2.5), abs=1e-5)
@@ -165,7 +168,12 @@ class TestOffsets:
 
     @pytest.mark.parametrize(
         ("offsets", "reason"),
-        [({"q_dt": 1.0}, "'q_dot'"), ({"q_dot": "much"}, "offset of 'q_dot'"), (1.0, "'offsets'")],
+        [
+            ({"q_dt": 1.0}, "'q_dot'"),
+            (dict.fromkeys(("q_dot", wide("q_dot")), 1.0), "'offsets': 'q_dot' and .* one name"),
+            ({"q_dot": "much"}, "offset of 'q_dot'"),
+            (1.0, "'offsets'"),
+        ],
     )
     def test_that_are_refused(self, offsets, reason, environments):
         envs = environments(spinning())
