@@ -106,6 +106,15 @@ def wine():
 
 
 @pytest.fixture
+def engine(request):
+    """Skip one test of a module where the C extension was not built."""
+    try:
+        require_engine(request.node.name)
+    except ConfigError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
 def opened():
     """Have things closed after the test."""
     with contextlib.ExitStack() as stack:

@@ -87,7 +87,7 @@ WITHOUT_EXTENSION = {
     "test_untidy_archives",
     "test_without_native",
 }
-"""Modules of which every test runs where the C extension was not built, too."""
+"""Modules that run where the C extension was not built, but for tests with ``engine``."""
 
 EVERY = {
     "test_golden_tasks": 4,

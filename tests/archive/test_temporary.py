@@ -50,6 +50,7 @@ def resource_fmu(folder, version):
 
 @each_root
 @pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.usefixtures("engine")
 def test_an_fmu_that_does_not_decode_uris(tmp_path, use, opened, version, name):
     root = use(name)
     config = {"model_input_names": [], "model_output_names": "y", "time_step": 0.5}
@@ -76,6 +77,7 @@ def test_a_plain_one_is_used(use):
     assert folder_name().parent == root
 
 
+@pytest.mark.usefixtures("engine")
 def test_without_a_plain_one(tmp_path, use, monkeypatch):
     """The message names the cure."""
     monkeypatch.setattr(temporary, "_OTHER_ROOTS", (str(tmp_path / "missing"), str(tmp_path / "é")))

@@ -218,6 +218,7 @@ class TestLibraries:
         assert other in out
         assert ": runs here" in out
 
+    @pytest.mark.usefixtures("engine")
     def test_of_another_name_in_a_process(self, named):
         runs(named(), isolation="process")
 
