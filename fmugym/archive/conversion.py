@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import repeat
 from operator import attrgetter
+from types import MappingProxyType
 from typing import Any, Final
 
 from fmpy.validation import validate_model_description
@@ -34,9 +36,21 @@ _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
 _SHARED: Final = attrgetter(
-    "type", "causality", "variability", "unit", "declaredType", "min", "max", "nominal", "shape"
+    "type",
+    "causality",
+    "variability",
+    "initial",
+    "unit",
+    "declaredType",
+    "min",
+    "max",
+    "nominal",
+    "shape",
 )
 """Attributes of FMPy's variables that are the same for many."""
+
+_NOTHING_MORE: Final[Mapping[str, str]] = MappingProxyType({})
+"""In the place of an element of the XML that has nothing but what FMPy reads."""
 
 _OPPOSITES: Final = {"Real", "Integer", "Boolean"}
 """The types of FMI 1.0 whose values can be negated."""
@@ -105,14 +119,23 @@ def _with_elements(source: Any, root: Any) -> Iterator[tuple[Any, Any]]:
 
     Names may come twice.
     """
+    found = root.xpath("ModelVariables[1]/*[@name]")
+    if not found:
+        yield from zip(source.modelVariables, repeat(_NOTHING_MORE))
+        return
     own = [variable for variable in source.modelVariables if variable.alias is None]
-    elements = dict(zip(own, root.xpath("ModelVariables[1]/*[@name]"), strict=True))
+    elements = dict(zip(own, found, strict=True))
     for variable in source.modelVariables:
-        yield variable, elements[variable.alias or variable]
+        element = elements[variable.alias or variable]
+        if variable.type.startswith("UInt"):  # of which FMPy leaves out the limits
+            variable.min, variable.max = element.get("min"), element.get("max")
+        yield variable, element
 
 
 def _namesakes(variables: Sequence[Variable]) -> dict[str, tuple[Variable, ...]]:
     """The variables of each name that is not unique."""
+    if len({variable.name for variable in variables}) == len(variables):  # as in most FMUs
+        return {}
     found: dict[str, list[Variable]] = {}
     for variable in variables:
         found.setdefault(variable.name, []).append(variable)
@@ -276,8 +299,6 @@ def _variables(pairs: Iterable[tuple[Any, Any]]) -> list[Variable]:
     templates: dict[Any, Variable] = {}
     variables = []
     for source, element in pairs:
-        if source.type.startswith("UInt"):  # of which FMPy leaves out the limits
-            source.min, source.max = element.get("min"), element.get("max")
         key = _what_is_shared(source, element)
         template = templates.get(key)
         if template is None:
@@ -289,14 +310,11 @@ def _variables(pairs: Iterable[tuple[Any, Any]]) -> list[Variable]:
 
 def _what_is_shared(source: Any, element: Any) -> tuple[Any, ...]:
     """All that ``_template`` reads, but for arrays and clocks, which have a template each."""
-    return (
-        _SHARED(source),
-        _initial(source),
-        _is_relative(source, element),
-        element.get("clocks"),
-        element.get("alias"),
-        source if source.dimensions or source.type == "Clock" else None,
-    )
+    more: tuple[Any, ...] = ()
+    if element is not _NOTHING_MORE:
+        more = (_is_relative(source, element), element.get("clocks"), element.get("alias"))
+    special = source if source.dimensions or source.type == "Clock" else None
+    return (_SHARED(source), source.start is None, special, more)
 
 
 def _template(source: Any, element: Any) -> Variable:

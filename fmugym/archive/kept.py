@@ -1,7 +1,8 @@
 """Model descriptions in the cache folder: large ones take seconds to parse, at every construction.
 
-A file holds JSON behind a checksum. What is damaged, or was written by another version of this
-package, is as good as missing, and so is a folder that cannot be read or written.
+A file holds JSON behind a checksum, which takes less time to write than to compress. What is
+damaged, or was written by another version of this package, is as good as missing, and so is a
+folder that cannot be read or written.
 """
 
 from __future__ import annotations
@@ -11,10 +12,8 @@ import hashlib
 import json
 import logging
 import math
-import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 _FOLDER: Final = "descriptions"
 _LARGEST: Final = 2**28
-"""Bytes that a file may have, and its text."""
+"""Bytes that a file may have."""
 
 _SIMPLE: Final = tuple(
     field.name
@@ -44,10 +43,9 @@ def kept(key: str) -> ModelDescription | None:
     """Read what was kept under a key; None if there is nothing, or nothing sound."""
     try:
         content = read_file(cache_folder(_FOLDER) / _name(key), _LARGEST)
-        digest, packed = content[:32], content[32:]
-        if hashlib.sha256(packed).digest() != digest:
+        digest, text = content[:32], content[32:]
+        if hashlib.sha256(text).digest() != digest:
             return None
-        text = zlib.decompressobj().decompress(packed, _LARGEST)
         return _description_of(json.loads(text))
     except Exception:  # whatever a file may hold
         return None
@@ -56,9 +54,9 @@ def kept(key: str) -> ModelDescription | None:
 def keep(key: str, description: ModelDescription) -> None:
     """Keep a model description under a key, as it was read."""
     try:
-        packed = zlib.compress(json.dumps(_plain(description)).encode(), 1)
+        text = json.dumps(_plain(description)).encode()
         path = cache_folder(_FOLDER) / _name(key)
-        replace_file(path, hashlib.sha256(packed).digest() + packed)
+        replace_file(path, hashlib.sha256(text).digest() + text)
     except (OSError, RecursionError) as error:
         logger.debug("the model description is not kept: %s", error)
 
@@ -99,11 +97,12 @@ def _plain(description: ModelDescription) -> dict[str, Any]:
 def _table(variables: Iterable[Variable]) -> dict[str, Any]:
     """What each variable has of its own, and the number of what it shares with its siblings."""
     rows = list(variables)
-    shared = {id(variable.shared): variable.shared for variable in rows}
+    each = [variable.shared for variable in rows]
+    shared = {id(one): one for one in each}
     numbers = {identity: number for number, identity in enumerate(shared)}
     return {
-        "own": [list(map(attrgetter(name), rows)) for name in OWN],
-        "numbers": [numbers[id(variable.shared)] for variable in rows],
+        "own": [[getattr(variable, name) for variable in rows] for name in OWN],
+        "numbers": [numbers[id(one)] for one in each],
         "shared": list(shared.values()),
     }
 

@@ -21,7 +21,7 @@ from lxml import etree
 from fmugym.archive.conversion import convert
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.kept import keep, kept
-from fmugym.archive.safe_zip import SafeZip, check_limit
+from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, check_limit
 from fmugym.errors import FMULoadError, reason
 
 __all__ = ["parse_xml", "read_model_description", "read_root", "read_xml"]
@@ -41,9 +41,21 @@ _BYTE_ORDER_MARKS: Final = {
     b"<\0": "utf-16-le",
     b"\0<": "utf-16-be",
 }
+_OF_UTF_8: Final = b'<?xml version="1.0" encoding="UTF-8"?>'
 _DECLARATION: Final = re.compile(rb"\A(<\?xml\s[^>]*\?>)?")
 _ENCODING: Final = re.compile(rb"""<\?xml[^>]*?\bencoding\s*=\s*["']([^"'>]*)["']""")
 _DEPENDENCIES: Final = re.compile(rb"""\sdependencies(Kind)?\s*=\s*("[^"]*"|'[^']*')""")
+_VARIABLES_BEGIN: Final = b"<ModelVariables>"
+_VARIABLES_END: Final = b"</ModelVariables>"
+_LEFT_OUT_BY_FMPY: Final = (
+    b"relativeQuantity",
+    b"negatedAlias",
+    b"clocks",
+    b"intervalVariability",
+    b"<UInt",
+)
+"""Where variables have none of this, ``convert`` needs nothing of them that FMPy does not read."""
+
 _ENCODINGS: Final = re.compile(r"utf-?8|(us-)?ascii|iso-?8859-\d+|(windows-|cp)125\d", re.I)
 """Encodings in which neither ``<`` nor ``=`` can hide. FMI 2.0 and 3.0 ask for UTF-8."""
 
@@ -95,12 +107,13 @@ def _read_or_recall(archive: SafeZip, content: bytes, interface: str | None) -> 
 
 def _read(archive: SafeZip, content: bytes, interface: str | None) -> ModelDescription:
     name, content = archive.path.name, _without_dependencies(content)
-    root = _parse_content(archive, content)
+    root = _parse_content(archive, _without_plain_variables(content, archive.limits))
     try:
         return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
         raise FMULoadError(f"{name}: {error}") from None
     except Exception as error:  # FMPy leaks a dozen types for malformed files
+        parse_xml(name, _XML, content)  # may be no XML where the variables are
         raise FMULoadError(
             f"{name}: {_XML} cannot be understood: {type(error).__name__}: {reason(error)}"
         ) from error
@@ -189,7 +202,7 @@ def _as_utf_8(content: bytes) -> bytes:
     if not re.fullmatch("utf-?8", encoding, re.IGNORECASE):
         content = content.decode(encoding).encode()
     text = content.removeprefix(_UTF_8_MARK).lstrip()
-    return _DECLARATION.sub(b'<?xml version="1.0" encoding="UTF-8"?>', text, count=1)
+    return text if text.startswith(_OF_UTF_8) else _DECLARATION.sub(_OF_UTF_8, text, count=1)
 
 
 def _encoding_of(content: bytes) -> str:
@@ -218,6 +231,23 @@ def _without_dependencies(content: bytes) -> bytes:
         return content
     rest = _DEPENDENCIES.sub(lambda match: b"\n" * match[0].count(b"\n"), content[start:])
     return content[:start] + rest
+
+
+def _without_plain_variables(content: bytes, limits: ArchiveLimits) -> bytes:
+    """Leave out the variables, unless they have what FMPy does not read.
+
+    FMPy parses them in any case, and twice takes much time and memory. They stay where it is not
+    sure where they begin and end, and where there may be too many, which are counted before FMPy
+    reads them. Line breaks stay, since errors have the numbers of lines.
+    """
+    start, end = content.find(_VARIABLES_BEGIN), content.find(_VARIABLES_END)
+    if not 0 <= start < end or content.count(b"ModelVariables") > 2:  # some may be in comments
+        return content
+    start += len(_VARIABLES_BEGIN)
+    special = any(content.find(text, start, end) >= 0 for text in _LEFT_OUT_BY_FMPY)
+    if special or content.count(b"valueReference", start, end) > limits.max_variables:
+        return content
+    return content[:start] + b"\n" * content.count(b"\n", start, end) + content[end:]
 
 
 def parse_xml(name: str, place: str, content: bytes) -> Any:

@@ -168,18 +168,21 @@ class Variable:
     ) -> Variable:
         """Make a variable that has these attributes, and all others of this one.
 
-        ``replace`` takes several times as long, which counts where there are 50,000 variables.
+        ``replace`` takes many times as long, which counts where there are 50,000 variables.
         """
         other = object.__new__(Variable)
-        other.__dict__.update(
-            self.shared,
-            shared=self.shared,
-            name=name,
-            value_reference=value_reference,
-            start=start,
-            description=description,
-        )
+        attributes = other.__dict__
+        attributes.update(self._attributes)
+        attributes["name"] = name
+        attributes["value_reference"] = value_reference
+        attributes["start"] = start
+        attributes["description"] = description
         return other
+
+    @cached_property
+    def _attributes(self) -> Mapping[str, Any]:
+        """What ``sibling`` copies: all attributes, and ``shared``, which need not be made again."""
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"shared": self.shared}
 
     @cached_property
     def kind(self) -> str:
