@@ -144,10 +144,18 @@ def _remainder(first: Any, second: Any) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """A power of float32 as C's ``powf`` has it; numpy's loop over arrays may round otherwise."""
-    pairs = np.broadcast(np.asarray(base, np.float32), np.asarray(exponent, np.float32))
-    powers = np.array([one**other for one, other in pairs], np.float32)
-    return powers.reshape(pairs.shape)[()]
+    """The function ``pow`` of C, of symbols too, which take a product for a constant exponent."""
+    return np.float_power(*np.broadcast_arrays(base, exponent))[()]
+
+
+def _power_of_float32(base: Any, exponent: Any) -> Any:
+    """The function ``powf`` of C; numpy's loop over arrays may round otherwise."""
+    operands = (np.float32(one) if isinstance(one, float) else one for one in (base, exponent))
+    bases, exponents = np.broadcast_arrays(*operands)
+    if type(bases) is not np.ndarray:  # but symbols
+        return np.power(bases, exponents)
+    pairs = zip(bases.flat, exponents.flat, strict=True)
+    return np.array([one**other for one, other in pairs], np.float32).reshape(bases.shape)[()]
 
 
 _OF_PYTHON: Final[Mapping[Any, Callable[..., Any]]] = {
@@ -168,6 +176,7 @@ _OF_PYTHON: Final[Mapping[Any, Callable[..., Any]]] = {
     np.right_shift: operator.rshift,
     np.divide: _divide,
     np.remainder: _remainder,
-    np.power: _power,
+    np.float_power: _power,
+    np.power: _power_of_float32,
 }
 """What takes the place of functions of numpy: on single numbers, it takes far less time."""

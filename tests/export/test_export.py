@@ -1,6 +1,7 @@
 """Exported agents do what the originals do: in C, in a loop with the plant."""
 
 import ctypes
+import re
 
 import gymnasium
 import numpy as np
@@ -45,6 +46,7 @@ HEATING = {
     "reward": "-abs(T - 21)",
 }
 LATE = "sin(elapsed / 3600) % 0.3 + previous(T) / 50"
+POWERS = "pow(T / 30, 2) + powf(previous(T) / 30, 2)"
 PRESENT = {"actions": ["u"], "observations": ["T", "price"], "normalize": True, "rescale": True}
 SENSOR = {"delay": "30min", "noise": 0.2, "quantum": 0.5, "bias": 0.3}
 TASKS = {
@@ -69,6 +71,10 @@ TASKS = {
     "expression": {
         "expressions": {"late": {"expr": LATE, "min": 0, "max": 2}},
         "agent": PRESENT | {"observations": ["T", "late"]},
+    },
+    "powers": {
+        "expressions": {"warm": {"expr": POWERS, "min": 0, "max": 4}},
+        "agent": PRESENT | {"observations": ["T", "warm"]},
     },
 }  # fmt: skip
 
@@ -371,6 +377,15 @@ class TestExternal:
         with pytest.raises(ConfigError, match="task file"):
             agent_of(env, network_for(env), external=["goal"])
         env.close()
+
+
+def test_powers_are_those_of_c(tmp_path):
+    """Not the products that numpy takes for a square."""
+    env = heating("powers")
+    write_c(agent_of(env, network_for(env, scaled=False)), tmp_path)
+    (source,) = tmp_path.glob("*.c")
+    assert {"pow(", "powf("} <= set(re.findall(r"\bpowf?\(", source.read_text()))
+    env.close()
 
 
 class TestFiles:

@@ -58,7 +58,7 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
 def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
     """The program from the action to the inputs."""
     graph = Graph()
-    values = _Readings(env, graph, has_stepped=False)
+    values = _Translation(env, graph, has_stepped=False)
     given = formulas.inputs
     inputs = values.elements_of_action() if given is None else map(values.of, given)
     variables = env.inside.interface.inputs
@@ -66,8 +66,8 @@ def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
     return compile_graph(graph, [Store(v.node, ("input", i)) for i, v in enumerate(typed)], [], 0)
 
 
-class _Readings:
-    """The values of a task's graph in the graph of a program.
+class _Translation:
+    """From the graph of a task to that of a program.
 
     Args:
         env: An environment of the task.
@@ -199,8 +199,8 @@ class _Judgement:
         program = compile_graph(graph, stores + more, results, len(seen))
         return program, tuple(array for array, _ in seen), updated
 
-    def _values(self) -> _Readings:
-        return _Readings(self._env, self._graph, True, dict(self._known))
+    def _values(self) -> _Translation:
+        return _Translation(self._env, self._graph, True, dict(self._known))
 
     def _told(self, kind: str) -> Value:
         """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
@@ -218,7 +218,7 @@ class _Judgement:
                     continue
                 for place, one in enumerate(value):
                     self._known["variables", name, place] = values.of(one).number
-        is_active, before = self._told("active"), _Readings(self._env, self._graph, True)
+        is_active, before = self._told("active"), _Translation(self._env, self._graph, True)
         stores: list[Store] = []
         for key in self._known:
             _, name, *places = key
@@ -246,7 +246,7 @@ class _Judgement:
         return [(array, [one.cast(array.dtype) for one in elements]), *parts]
 
 
-def _named(path: tuple[str, ...], part: Computed, values: _Readings) -> Iterator[_Seen]:
+def _named(path: tuple[str, ...], part: Computed, values: _Translation) -> Iterator[_Seen]:
     """The values of an info, each with the names that lead to it."""
     if isinstance(part, Mapping):
         for name, one in part.items():
