@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, TypeAlias
 
 from fmugym.archive.description import Unit
 from fmugym.archive.units import IDENTITY, Conversion, conversion_of_link
 from fmugym.archive.variable import MOST_ELEMENTS, Variable
+from fmugym.checks import Spellings, normal_form
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
@@ -83,6 +84,8 @@ class Wiring:
     _causalities: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self._spellings = Spellings("component", self.components)
+        self._spelt = {normal_form(name): name for name in self.own_names}
         for connection in self.connections:
             self._add(connection)
         self._check_units()
@@ -97,6 +100,10 @@ class Wiring:
 
     def _add(self, connection: Connection) -> None:
         source, target = self.port(connection.source), self.port(connection.target)
+        if source is None:
+            connection = replace(connection, source=self._own_name(connection.source))
+        if target is None:
+            connection = replace(connection, target=self._own_name(connection.target))
         if source is None and target is None:
             raise ConfigError(
                 f"{connection}: one of the two must be a variable of a component; components are: "
@@ -113,6 +120,10 @@ class Wiring:
             else:
                 self.links.append(self._link(connection, source, target))
 
+    def _own_name(self, name: str) -> str:
+        """A name of the system as it was spelt first; its letters may only look other."""
+        return name if name in self.own_names else self._spelt.setdefault(normal_form(name), name)
+
     def port(self, name: str) -> Port | None:
         """Find the variable that a name stands for; None for a name of the system itself.
 
@@ -121,10 +132,11 @@ class Wiring:
         """
         dots = [place for place, letter in enumerate(name) if letter == "."]
         for dot in reversed(dots):
-            component = self.components.get(name[:dot])
-            if component is not None:
+            own = self._spellings.find(name[:dot])
+            if own is not None:
+                component = self.components[own]
                 return Port(component, component.variable(name[dot + 1 :]))
-        if dots and name not in self.own_names:
+        if dots and self._own_name(name) not in self.own_names:
             raise unknown_name("component", name[: dots[0]], self.components)
         return None
 
@@ -200,7 +212,7 @@ class Wiring:
 
     def _claim(self, name: str, causality: str, connection: Connection) -> None:
         """Let a name of the system mean one thing."""
-        if name in self.components:
+        if self._spellings.find(name) is not None:
             raise ConfigError(f"{connection}: {name!r} is a component; which of its variables?")
         known = self._causalities.setdefault(name, causality)
         if known != causality:

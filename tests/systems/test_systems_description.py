@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import pytest
 from fmu_tools import PlainEnv
+from letters import wide
 from system_tools import links_of
 
 from fmugym import Component, Connection, FMUSystem, bundled_fmu
@@ -123,6 +124,32 @@ def logic(tmp_path_factory):
         "        return True\n"
     )
     return FmuBuilder.build_FMU(folder / "logic.py", dest=folder)
+
+
+class TestLetters:
+    """Names are also found by letters that only look other: components, and the system's own."""
+
+    def test_of_components(self):
+        ohm, other = "R_\u03a9", "R_\u2126"  # a Greek letter, and the sign of the unit
+        system = FMUSystem({ohm: HOUSE, "b": HOUSE}, [f"{other}.Q_em -> {wide('b')}.Q_int"])
+        assert links_of(system) == [(ohm, "Q_em", "b", "Q_int", 1.0, 0.0)]
+        with pytest.raises(ConfigError, match="is a component; which of its variables"):
+            houses(f"{wide('a')} -> b.Q_int")
+        with pytest.raises(ConfigError, match="unknown component 'c'"):
+            houses("c.Q_em -> b.Q_int")
+
+    def test_of_the_system(self):
+        system = houses(
+            "\u00b5 -> a.T_out",
+            "\u03bc -> b.T_out",
+            "a.T_air -> k\u00fchl",
+            units={"ku\u0308hl": "degC"},
+        )
+        source, target = system.plan.connectors
+        assert (source.name, len(source.ends)) == ("\u00b5", 2)
+        assert (target.name, target.unit) == ("ku\u0308hl", "degC")
+        with pytest.raises(ConfigError, match=r"two sources: a\.T_air, b\.T_air"):
+            houses("a.T_air -> k\u00fchl", "b.T_air -> ku\u0308hl")
 
 
 class Env(PlainEnv):
