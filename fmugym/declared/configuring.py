@@ -8,7 +8,7 @@ from fmugym.archive.description import ModelDescription
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
 from fmugym.declared.naming import CLOCK, Naming
-from fmugym.declared.quantities import steps_in
+from fmugym.declared.numbers import steps_in
 from fmugym.declared.seasons import read_begin, read_scenarios
 from fmugym.distributions import is_distribution
 

@@ -121,7 +121,7 @@ def chance_in(count: Value, channel: int) -> Value:
 
 def first_step(graph: Graph) -> Value:
     """The number 0 in each step: what is random and follows from it lasts for an episode."""
-    return Value.read(graph, "step_count", dtype=np.int64) * 0
+    return Value.read(graph, "step_count") * 0
 
 
 def _drawn(distribution: Any, graph: Graph, channel: int) -> Value:

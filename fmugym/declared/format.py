@@ -24,7 +24,7 @@ from fmugym.checks import (
 )
 from fmugym.config import CONFIG, FOREIGN
 from fmugym.declared.dates import moment_of_year, zone_of
-from fmugym.declared.quantities import constant_of, finite, number, number_or_distribution
+from fmugym.declared.numbers import constant_of, finite, number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown
 from fmugym.expressions.language import Expression

@@ -15,7 +15,7 @@ from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import BUILT_IN, Declarations
 from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import nearest_steps, steps_in
+from fmugym.declared.numbers import nearest_steps, steps_in
 from fmugym.declared.variables import TaskVariable
 from fmugym.errors import ConfigError, ConsequenceError, unknown_name
 from fmugym.expressions.graph import Graph
@@ -149,9 +149,9 @@ class Naming:
         aliases = [n for n in self._places if n not in self._firsts]
         return place if name not in aliases else len(self.outputs) + aliases.index(name)
 
-    def read(self, attribute: str, *keys: str | int, dtype: npt.DTypeLike = np.float64) -> Value:
-        """A value that the environment has; see ``Value.read``."""
-        return Value.read(self.graph, attribute, *keys, dtype=dtype)
+    def read(self, name: str, *keys: str | int, dtype: npt.DTypeLike | None = None) -> Value:
+        """A value that an episode has; see ``Value.read``."""
+        return Value.read(self.graph, name, *keys, dtype=dtype)
 
     def constant(self, number: float | bool) -> Value:
         """A value that is the same everywhere."""
@@ -160,7 +160,7 @@ class Naming:
     @property
     def step_count(self) -> Value:
         """The steps since the reset."""
-        return self.read("step_count", dtype=np.int64)
+        return self.read("step_count")
 
     def value(
         self,
@@ -310,7 +310,7 @@ class Naming:
 
     def _done(self, moment: Moment) -> Value | None:
         if moment is Moment.JUDGED:
-            return self.read("done", dtype=np.bool_)
+            return self.read("done")
         if moment is not Moment.UPDATED:
             return None
         flags, entry = self.declared.flags, self.declared.root.child("terminated")
@@ -369,7 +369,7 @@ class Naming:
             return variable.conversion(self.read("parameters", variable.fmu_variable.name))
         if name not in self._places:
             raise ConsequenceError(f"{name!r} is no variable of the FMU")
-        value = self.read("inside.readings.values", self._places[name])
+        value = self.read("outputs", self._places[name])
         return variable.conversion(value)
 
     def _previous_value_of(self, name: str) -> Value | None:
@@ -380,7 +380,7 @@ class Naming:
             if not declared.knows_actions:
                 raise ConsequenceError(f"{name!r} may be an action")
             return None
-        return variable.conversion(self.read("previous_state", self._places[name]))
+        return variable.conversion(self.read("previous_outputs", self._places[name]))
 
     def action(self, variable: TaskVariable, attribute: str) -> Value:
         """An action in the unit of the task.

@@ -27,6 +27,7 @@ from fmugym.declared.enumerations import check_written
 from fmugym.declared.kpis import Kpi, kpi_name
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
+from fmugym.declared.numbers import steps_in
 from fmugym.declared.observing import (
     NoiseKey,
     Seen,
@@ -39,7 +40,6 @@ from fmugym.declared.observing import (
 )
 from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp
-from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
 from fmugym.declared.variables import TaskVariable, is_plain

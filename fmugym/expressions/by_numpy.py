@@ -17,6 +17,7 @@ import numpy as np
 from fmugym.expressions.formulas import Update
 from fmugym.expressions.graph import Graph, Node
 from fmugym.expressions.lowering import registers_of
+from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value
 
 __all__ = ["function_of", "update_by"]
@@ -87,8 +88,8 @@ def _operation(graph: Graph, node: Node) -> Callable[..., Any]:
     what: Any = node.what
     match node.kind:
         case "row":
-            attribute, *keys = what
-            read = operator.attrgetter(attribute)
+            name, *keys = what
+            read = operator.attrgetter(QUANTITIES[name].in_hooks if name in QUANTITIES else name)
             return lambda env: reduce(operator.getitem, keys, read(env))
         case "cast":
             return partial(_cast, node.dtype)

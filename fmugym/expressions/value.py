@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fmugym.errors import ConfigError
 from fmugym.expressions.graph import Cell, Graph
 from fmugym.expressions.program import operation_of
+from fmugym.expressions.quantities import QUANTITIES
 
 __all__ = ["Computed", "Value", "where"]
 
@@ -59,17 +60,19 @@ class Value:
 
     @classmethod
     def read(
-        cls, graph: Graph, attribute: str, *keys: str | int, dtype: npt.DTypeLike = _DOUBLE
+        cls, graph: Graph, name: str, *keys: str | int, dtype: npt.DTypeLike | None = None
     ) -> Value:
-        """The node of a value that an environment has when it is asked.
+        """The node of a value that an episode has when it is asked.
 
         Args:
             graph: Gets the node.
-            attribute: The attribute of the environment.
+            name: A quantity, see ``QUANTITIES``; or an attribute of what functions are called with.
             keys: What to index it with, one key after the other.
-            dtype: The type of the value.
+            dtype: The type of the value, by default that of the quantity.
         """
-        return cls(graph, graph.load("row", (attribute, *keys), dtype, None))
+        if dtype is None:
+            dtype = QUANTITIES[name].dtype if name in QUANTITIES else _DOUBLE
+        return cls(graph, graph.load("row", (name, *keys), dtype, None))
 
     @property
     def node(self) -> int:

@@ -13,6 +13,7 @@ from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.graph import Cell, Graph
 from fmugym.expressions.lowering import Store, compile_graph
 from fmugym.expressions.program import Program, UntraceableError, letter_of
+from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
 from fmugym.task.step import ORDER
 from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
@@ -114,13 +115,9 @@ class _Translation:
         self._graph.tables["values of the action"] = np.array(values)
         return [one.taken("values of the action") for one in elements]
 
-    def variable(self, name: str, place: int) -> Value:
-        """An element of an episode variable before this step wrote it."""
-        return self._row("before" if self._has_stepped else "variable", name, place)
-
-    def output(self, place: int) -> Value:
-        """A value that is read from the FMU."""
-        return self._row("output", place)
+    def quantity(self, name: str, *keys: str | int) -> Value:
+        """A quantity of the episode as it is now."""
+        return self._read((name, *keys))
 
     def _row(self, *what: Any, dtype: np.dtype[Any] = _DOUBLE) -> Value:
         return Value(self._graph, self._graph.load("row", what, dtype, None))
@@ -131,27 +128,19 @@ class _Translation:
 
     def _read(self, what: Any) -> Value:
         """What an environment has, see ``Value.read``."""
-        attribute, *keys = what
         if what in self._known:
             return self._known[what]
-        match attribute, keys:
-            case "inside.readings.values", [place]:
-                return self.output(place)
-            case "previous_state", [place]:
-                return self._row("kept", place) if self._has_stepped else self.output(place)
-            case "inputs", [place]:
-                return self._row("input", place)
-            case "parameters", [name]:
-                return self._row("parameter", name, 0)
-            case "variables", [name, *places]:
-                return self.variable(name, places[0] if places else 0)
-            case "action" | "previous_action", places:
-                return self._loaded(attribute, places[0] if places else 0)
-            case "step_count", []:
-                return self._row("step_count", 0, dtype=np.dtype(np.int64))
-            case "time", []:
-                return self._time()
-        raise UntraceableError(f"programs do not read {attribute!r}")
+        name, *keys = what
+        if name in ("action", "previous_action"):
+            return self._loaded(name, keys[0] if keys else 0)
+        if name == "time":
+            return self._time()
+        quantity = QUANTITIES[name]
+        kind = quantity.after if self._has_stepped else quantity.before
+        if kind is None:
+            raise UntraceableError(f"it reads {name!r} before there is one")
+        place = keys.pop() if keys and isinstance(keys[-1], int) else 0
+        return self._row(kind, *keys, place, dtype=quantity.dtype)
 
     def _time(self) -> Value:
         """The time of the FMU, as ``FMUEnv.time`` computes it."""
@@ -159,7 +148,7 @@ class _Translation:
         start: Value | float = spec.start_time
         if env.config.draws_start_time:
             start = self._row("parameter", "start_time", 0)
-        count: Value = (self._read(("step_count",)) + env.inside.warm_up_steps) * spec.substeps
+        count: Value = (self.quantity("step_count") + env.inside.warm_up_steps) * spec.substeps
         return count * spec.time_step / spec.substeps + start
 
 
@@ -223,7 +212,7 @@ class _Judgement:
         for key in self._known:
             _, name, *places = key
             place = places[0] if places else 0
-            kept = where(is_active, self._known[key], before.variable(name, place))
+            kept = where(is_active, self._known[key], before.quantity("variables", name, place))
             self._known[key] = kept
             stores.append(Store(kept.node, ("variable", name, place)))
         return stores, tuple(written)
@@ -239,7 +228,9 @@ class _Judgement:
         if not isinstance(space, spaces.Box | spaces.MultiBinary):
             raise UntraceableError(f"programs make no observations of {space}")
         if given is None:
-            elements = [values.output(place) for place in range(env.inside.output_count)]
+            elements = [
+                values.quantity("outputs", place) for place in range(env.inside.output_count)
+            ]
         else:
             elements = [values.of(one) for one in given]
         array = SeenArray(("observation",), (len(elements),), np.dtype(space.dtype))
