@@ -45,6 +45,16 @@ _TOO_LONG: Final = {
 }
 """What no task file needs, as patterns, and what to say of it."""
 
+_IN_A_KEY: Final = (
+    "(?:Invalid statement|Invalid initial character for a key part|Expected '=' after a key|"
+    "Expected ']' at the end of a table)"
+)
+"""What the parser of TOML says of a key in letters that only keys in quotes may have."""
+
+_BARE_KEY: Final = r"""[^\s=.,\[\]{}"'\\#]+"""
+_MOST_PARSED: Final = 10**7
+"""Characters that may be parsed to find such keys, one after the other: seconds."""
+
 
 @dataclass(frozen=True, repr=False)
 class Task:
@@ -277,28 +287,60 @@ def _read(path: Path) -> Source:
         raise missing_file("task file", path, "*.toml") from None
     except OSError as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
-    document = _parsed(path, text)
+    document, text = _parsed(path, text)
     source = Source(path, path.parent, text, _with_paths(_plain(document), path.parent))
     _check(source)
     return source
 
 
-def _parsed(path: Path, text: str) -> dict[str, Any]:
-    """Parse TOML; the parser takes more than linear time for long keys and numbers."""
+def _parsed(path: Path, text: str) -> tuple[dict[str, Any], str]:
+    """Parse TOML; the parser takes more than linear time for long keys and numbers.
+
+    Returns:
+        The document, and its text, in which keys such as ``µ`` stand in quotes.
+    """
     for pattern, what in _TOO_LONG.items():
         match = re.search(pattern, text, re.MULTILINE)
         if match:
             line = 1 + text.count("\n", 0, match.end())
             raise ConfigError(f"{path.name}, line {line}: {what}")
     try:
-        document = tomllib.loads(text)
+        document, text = _loaded(text)
     except tomllib.TOMLDecodeError as error:
         hint = _hint_of(text, str(error))
         raise ConfigError(f"{path.name} is no TOML file: {reason(error)}{hint}") from None
     except (ValueError, RecursionError):
         raise ConfigError(f"{path.name}: {_TOO_DEEP}") from None
     _require_shallow(document, f"{path.name}: ")
-    return document
+    return document, text
+
+
+def _loaded(text: str) -> tuple[dict[str, Any], str]:
+    """Parse TOML in which keys without quotes may have the letters of any language."""
+    for _ in range(_MOST_PARSED // (len(text) + 1)):
+        try:
+            return tomllib.loads(text), text
+        except tomllib.TOMLDecodeError as error:
+            quoted = _with_quoted_key(text, str(error))
+            if quoted is None:
+                raise
+            text = quoted
+    return tomllib.loads(text), text
+
+
+def _with_quoted_key(text: str, error: str) -> str | None:
+    """Put the key in quotes at whose letters the parser stumbles; None if it does at another."""
+    place = re.search(rf"{_IN_A_KEY}.* \(at line (\d+), column (\d+)\)", error)
+    if place is None:
+        return None
+    lines = text.replace("\r\n", "\n").split("\n")
+    number, column = int(place[1]) - 1, int(place[2]) - 1
+    for key in re.finditer(_BARE_KEY, lines[number]):
+        start, end = key.span()
+        if start <= column < end and not key[0].isascii():
+            lines[number] = f'{lines[number][:start]}"{key[0]}"{lines[number][end:]}'
+            return "\n".join(lines)
+    return None
 
 
 def _hint_of(text: str, error: str) -> str:
@@ -310,9 +352,7 @@ def _hint_of(text: str, error: str) -> str:
     key = lines[int(line[1]) - 1].partition("=")[0].strip() if line else ""
     if re.match("Cannot (overwrite|declare|mutate)", error):
         return f"; {key} is given there once more: remove one of both, or rename it"
-    if key.isascii():
-        return ""
-    return f"; keys of other letters than those of English stand in quotes: {shown(key)}"
+    return ""
 
 
 def _require_shallow(document: Any, place: str = "") -> None:

@@ -223,10 +223,42 @@ def test_a_name_is_given_once(other):
         fmugym.load({**config, "data": {other: {"values": [1], "step": 1}}})
 
 
-def test_a_key_of_toml_needs_quotes(tmp_path):
+def test_a_key_of_toml_needs_no_quotes(tmp_path, load):
+    """TOML 1.0 asks for them; what is written has them."""
+    file, other = tmp_path / "task.toml", tmp_path / "other.toml"
+    file.write_bytes(
+        """\
+fmu = { bundled = "Pendulum" }  # \u00b5 is the angle
+time_step = 0.05
+reward = { R_\u03a9 = "-abs(\u03bc)", "\u00fc" = "-abs(ku\u0308hl)" }
+[variables.\u00b5]
+name = "theta"
+[variables]
+ku\u0308hl = { name = "theta_dot" }
+\u0442\u043e\u043a = { name = "tau", min = -1, max = 1 }
+[agent]
+actions = "\u0442\u043e\u043a"
+observations = ["\u00b5", "k\u00fchl"]
+""".replace("\n", "\r\n").encode()
+    )
+    env = load(file)
+    env.reset(seed=0)
+    *_, info = env.step(env.action_space.high)
+    assert {*info["reward_terms"]} == {"R_\u03a9", "\u00fc"}
+    fmugym.Task.read(file).write(other)
+    assert '"\u0442\u043e\u043a" = ' in other.read_text(encoding="utf-8")
+    assert fmugym.Task.read(other) == fmugym.Task.read(file)
+
+
+@pytest.mark.parametrize(
+    "text", ["a = \u00b5", "a = 1\u00b5", "a = 1 \u00b5 = 2", "a \u00b5", "[a\u00b5"]
+)
+def test_other_mistakes_stay_mistakes(text, tmp_path):
     file = tmp_path / "task.toml"
-    file.write_text('[variables]\n\u00b5 = { name = "q" }\n', encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"line 2.*stand in quotes: '\u00b5'"):
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(
+        ConfigError, match=r"task\.toml is no TOML file: .*(line 1|end of document)"
+    ):
         fmugym.load(file)
 
 
