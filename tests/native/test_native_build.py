@@ -15,7 +15,7 @@ from process_tools import run_python
 from setuptools import Extension
 
 import build_backend
-from fmugym.vector.hooks import program
+from fmugym.expressions import program
 
 pytest.importorskip("ziglang", reason="needs ziglang: the extra test")
 
