@@ -24,7 +24,7 @@ from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import attempt, compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
-from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
+from fmugym.vector.hooks.formula_programs import formulas_of
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.purity import names_in_hooks, require_pure
@@ -327,9 +327,8 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TaskProgram
 
     Formulas need no comparison.
     """
-    formulas = formulas_of(env)
-    if formulas is not None:
-        return compile_formulas(env, formulas)
+    if formulas_of(env):
+        return compile_hooks(env, [])
     if _is_debugged():
         raise UntraceableError("a debugger is attached")
     require_pure(env)

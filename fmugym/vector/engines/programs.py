@@ -42,11 +42,8 @@ def find_programs(env: FMUEnv, required: bool) -> TaskPrograms:
     """
 
     def make() -> TaskPrograms:
-        formulas = formulas_of(env)
-        if formulas is not None:
-            return compile_formulas(env, formulas)
-        batches = [sample_states(env, scales) for scales in ((1.0,), _WILD_SCALES)]
-        task = compile_hooks(env, batches)
+        kinds = () if formulas_of(env) else ((1.0,), _WILD_SCALES)
+        task = compile_hooks(env, [sample_states(env, scales) for scales in kinds])
         if required and task.left:
             raise UntraceableError("; ".join(task.left.values()))
         return task
@@ -97,7 +94,7 @@ def compile_hooks(
     Args:
         env: A prototype whose hooks work on arrays.
         batches: What the hooks read where they are compared; only in the first one, they must find
-            all that they look up in their tables.
+            all that they look up in their tables. Formulas are not compared, and need none.
         attributes: Those that have one number for each environment, by name.
 
     Raises:
