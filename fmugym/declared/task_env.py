@@ -18,7 +18,7 @@ __all__ = ["TaskEnv"]
 
 
 _ARGUMENTS: Final = (
-    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "master", "scenario"),
+    *("config", "log_level", "render_mode", "backend", "isolation", "master", "scenario"),
 )
 
 _NOT_DECLARED: Final = frozenset(
@@ -39,7 +39,6 @@ class TaskEnv(FMUEnv):
         render_mode: As for ``FMUEnv``.
         backend: As for ``FMUEnv``.
         isolation: As for ``FMUEnv``.
-        hooks: As for ``FMUEnv``.
         master: Of a system: ``"gauss_seidel"`` or ``"jacobi"``, in the place of what its SSP
             archive or the task says.
 
@@ -56,6 +55,8 @@ class TaskEnv(FMUEnv):
         FMULoadError: If the FMU cannot be used on this machine.
     """
 
+    vectorized = True  # the default of ``_is_done`` here
+
     def __init__(
         self,
         config: Any,
@@ -64,7 +65,6 @@ class TaskEnv(FMUEnv):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
-        hooks: str = "auto",
         master: str | None = None,
         **unknown: Never,
     ) -> None:
@@ -95,8 +95,7 @@ class TaskEnv(FMUEnv):
         }
         for name, function in functions.items():
             setattr(self, name, function)
-        if not own & _NOT_DECLARED:
-            self.inside.formulas = resolved.formulas, functions
+        self.inside.formulas = None if own & _NOT_DECLARED else resolved.formulas, functions
         with self.task.root.placing():
             super().__init__(
                 source,
@@ -105,7 +104,6 @@ class TaskEnv(FMUEnv):
                 render_mode=render_mode,
                 backend=backend,
                 isolation=isolation,
-                hooks=hooks,
             )
 
     @property

@@ -87,6 +87,7 @@ class CartPoleEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
+    vectorized = True
     steps_after_end: ClassVar[bool] = True
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "low", "high")
 

@@ -113,6 +113,7 @@ class CloudPendulumEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
+    vectorized = True
     render_size: ClassVar[tuple[int, int]] = (500, 500)
 
     def __init__(

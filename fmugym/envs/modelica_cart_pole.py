@@ -74,6 +74,7 @@ class ModelicaCartPoleEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
+    vectorized = True
 
     def __init__(
         self,

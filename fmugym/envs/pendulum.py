@@ -79,6 +79,7 @@ class PendulumEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
+    vectorized = True
     steps_after_end: ClassVar[bool] = True
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "x_init", "y_init")
     render_size: ClassVar[tuple[int, int]] = (500, 500)

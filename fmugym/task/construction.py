@@ -35,6 +35,7 @@ from fmugym.task.plain import plain_attributes
 from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
+from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
@@ -218,8 +219,14 @@ def require_construction(env: Constructed) -> None:
 
 
 def prepare_hooks(env: Constructed) -> None:
-    """Find out which hooks an environment overrides, and prepare the defaults of the others."""
+    """Find out which hooks an environment overrides, and prepare the defaults of the others.
+
+    Raises:
+        ConfigError: If a hook is an attribute of the environment; only tasks of expressions have
+            such hooks.
+    """
     inside, space, base = env.inside, env.observation_space, env.inside.base
+    _require_methods(env)
     inside.own = own = OwnHooks.of(env, base)
     if env.config.draws_start_time and env.config.stop_time is not None:
         _let_stop_time_end_episodes(env)
@@ -240,6 +247,17 @@ def prepare_hooks(env: Constructed) -> None:
     inside.has_info = own.get_info or inside.pool_tells
     inside.input_writer = InputWriter(interface.inputs)
     inside.as_constructed = plain_attributes(vars(env), inside.own_names)
+
+
+def _require_methods(env: Constructed) -> None:
+    known, attributes = env.inside.formulas[1], vars(env)
+    for name in (*ORDER, "_goal_reward"):
+        value = attributes.get(name)
+        if value is not known.get(name) and not isinstance(value, _StopTime):
+            raise ConfigError(
+                f"{name} was assigned to an environment of {type(env).__name__}; write this hook "
+                "as a method of the class"
+            )
 
 
 def _let_stop_time_end_episodes(env: Constructed) -> None:

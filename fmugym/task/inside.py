@@ -71,7 +71,6 @@ class Inside:
     Attributes:
         number: Tells which environments are newer.
         base: ``FMUEnv``, with whose methods those of an environment are compared.
-        way: The way of calling hooks, see ``FMUEnv``.
         own_names: The attributes that are not a subclass's own.
         as_constructed: The plain attributes of a subclass when its hooks were prepared.
         interface: The variables of the config, as the FMU has them.
@@ -169,10 +168,9 @@ class Inside:
     warm_up_steps: int
     warm_ups: WarmUps | None
     was_reset: bool
-    way: str
 
     def __init__(self, number: int) -> None:
-        self.number, self.own_names, self.way = number, frozenset(), "auto"
+        self.number, self.own_names = number, frozenset()
         self.pool_tells = self.has_info = self.has_chosen = False
         self.in_hooks = self.was_reset = self.is_closed = False
         self.standing_in = RLock()

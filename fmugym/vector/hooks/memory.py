@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,6 @@ class Memory:
         env: An environment, for what all have in common.
         readings: What the hooks of all read; its arrays become those that steps keep.
         ended: Which episodes have ended, shape (N,).
-        attributes: Attributes that have one number for each environment, by name.
 
     Attributes:
         ended: As given.
@@ -41,14 +40,8 @@ class Memory:
         before: The same before the step.
     """
 
-    def __init__(
-        self,
-        env: FMUEnv,
-        readings: Readings,
-        ended: MaskArray,
-        attributes: Mapping[str, npt.NDArray[Any]],
-    ) -> None:
-        self._env, self._readings, self._attributes = env, readings, attributes
+    def __init__(self, env: FMUEnv, readings: Readings, ended: MaskArray) -> None:
+        self._env, self._readings = env, readings
         self._n = len(ended)
         self.ended, self.parameters = ended, readings.parameters
         self.kept, self._done = np.zeros_like(readings.values), np.zeros(self._n, np.bool_)
@@ -132,8 +125,6 @@ class Memory:
                 return self.parameters[name]
             case "step_count":
                 return self._readings.step_count
-            case "attribute":
-                return self._attributes[name]
         arrays = self.variables if kind == "variable" else self.before
         return arrays[name].reshape(-1, self._n)[index]
 
