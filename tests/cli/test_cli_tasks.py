@@ -153,7 +153,7 @@ class TestValidate:
     def test_a_sound_task(self):
         report = validate(lambda: fmugym.load(TASK))
         assert report.verdict == "ok"
-        assert report.hooks == "compiled"
+        assert report.hooks == "expressions"
         (export,) = [one.text for one in report.findings if one.check == "export"]
         assert "can be exported; it measures q" in export
         assert 0 < report.costs["step"] < 1

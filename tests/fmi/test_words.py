@@ -140,7 +140,7 @@ def test_environments_of_a_vector_say_their_own(tmp_path):
     path = words_fmu(tmp_path, 2, "step")
     at = {"distribution": "choice", "values": [0, 2]}
     for options in ({"threads": 1}, {"threads": 2}, {"isolation": "process", "workers": 2}):
-        options |= {"hooks": "array", "autoreset_mode": "Disabled"}
+        options |= {"way": "arrays", "autoreset_mode": "Disabled"}
         envs = fmugym.FMUVectorEnv(lambda: WordsEnv(path, at=at), 8, **options)
         _, infos = envs.reset(seed=1)
         for _ in range(2):

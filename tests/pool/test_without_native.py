@@ -14,7 +14,7 @@ import gymnasium, fmugym, numpy
 env = gymnasium.make("fmugym/CartPole-v0")
 env.reset(seed=1)
 single = [env.step(1)[0].tolist() for _ in range(5)]
-envs = gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2, hooks="per_env")
+envs = gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2, hooks="one by one")
 envs.reset(seed=1)
 assert single == [envs.step(numpy.array([1, 1]))[0][0].tolist() for _ in range(5)]
 for refused in (

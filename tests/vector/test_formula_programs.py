@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import test_declared
 import test_declared_single
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError
@@ -28,7 +29,10 @@ def no_trace(*_, **__):
 def test_no_hook_is_called(task, load, make_envs, monkeypatch):
     for name in ("trace_hooks", "sample_states", "require_same"):
         monkeypatch.setattr(programs, name, no_trace)
-    made = load(task, hooks="compiled"), make_envs(lambda: fmugym.load(task), 3, hooks="compiled")
+    made = (
+        load(task, way="expressions"),
+        make_envs(in_way("expressions", lambda: fmugym.load(task)), 3),
+    )
     for env in made:
         env.reset(seed=1)
         for _ in range(3):
@@ -44,8 +48,8 @@ def test_the_time_begins_where_it_is_drawn(load):
         "reward": {"now": "time", "since": "elapsed", "steps": "step"},
     }
     told = []
-    for hooks in ("compiled", "python"):
-        env = load(task, hooks=hooks)
+    for hooks in ("expressions", "Python"):
+        env = load(task, way=hooks)
         for seed in (3, None, 4):
             env.reset(seed=seed)
             for _ in range(5):
@@ -97,7 +101,7 @@ def test_a_task_that_is_too_long_for_a_program_runs_on_arrays(make_envs):
     expected = [(np.sin(one[0] * number) + number).sum() for one in envs.get_attr("state")]
     assert rewards == pytest.approx(expected)
     with pytest.raises(ConfigError, match="more than 20000 operations"):
-        make_envs(lambda: fmugym.load(task), 2, hooks="compiled")
+        make_envs(in_way("expressions", lambda: fmugym.load(task)), 2)
 
 
 @test_declared.each_file

@@ -64,7 +64,7 @@ def test_results_are_those_of_one_process(cls):
 
 
 def test_hooks_cannot_be_compiled():
-    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
+    env = fmugym.envs.CartPoleEnv(way="compiled", isolation="process")
     with pytest.raises(ConfigError, match="not a native one of its own"):
         env.reset(seed=0)
     env.close()
@@ -72,7 +72,7 @@ def test_hooks_cannot_be_compiled():
 
 def test_a_process_that_is_killed(cart):
     """The episode is cut short; the next ones are as without a worker."""
-    other = fmugym.envs.CartPoleEnv(hooks="python")
+    other = fmugym.envs.CartPoleEnv(way="python")
     other.reset(seed=0)
     before = other.step(0)
     os.kill(cart.inside.pool.processes()[0], signal.SIGKILL)
@@ -94,7 +94,7 @@ def test_a_worker_that_sleeps_is_woken(cart):
     def sleeps():
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
 
-    with fmugym.envs.CartPoleEnv(hooks="python") as other:
+    with fmugym.envs.CartPoleEnv(way="python") as other:
         other.reset(seed=0)
         other.step(0)
         for _ in range(3):

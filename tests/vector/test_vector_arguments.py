@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from odd_values import Unspeakable
 from vector_tools import Drawing, each_way, require_equal
+from ways import in_way
 
 from fmugym import ConfigError
 from fmugym.vector import FMUVectorEnv
@@ -18,7 +19,7 @@ SEEDS = (
 
 @pytest.mark.parametrize("seed", SEEDS, ids=lambda seed: type(seed).__name__)
 def test_seeds_that_do_not_fit(seed, make_envs):
-    vector = make_envs(Drawing, 3, hooks="array")
+    vector = make_envs(in_way("arrays", Drawing), 3)
     with pytest.raises(ConfigError, match="seed"):
         vector.reset(seed=seed)
 
@@ -65,7 +66,7 @@ def test_options_that_are_no_dict(options, make_envs):
 
 @each_way
 def test_unknown_options_are_named(hooks, make_envs):
-    vector = make_envs(Drawing, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, Drawing), 2)
     with pytest.raises(ConfigError, match="did you mean 'model_parameters'"):
         vector.reset(options={"model_parameter": {}})
     with pytest.raises(ConfigError, match="unknown"):
@@ -113,7 +114,7 @@ BAD = (
     *(("private_libraries", value) for value in (0, 1, "yes", [True], Unspeakable())),
     *(("isolation", value) for value in (1, "proces", ["process"], np.ones(2), Unspeakable())),
     *(("max_episode_steps", value) for value in (0, 1.5, Unspeakable())),
-    *(("hooks", value) for value in (None, 1, ["array"], np.ones(2), Unspeakable())),
+    *(("hooks", value) for value in (None, 1, ["arrays"], np.ones(2), Unspeakable())),
     *(("autoreset_mode", value) for value in (None, 1, ["next_step"], np.ones(2), Unspeakable())),
     *(("make_env", value) for value in (None, 1, "fmugym.envs:CartPoleEnv", [Drawing])),
 )

@@ -13,6 +13,7 @@ from vector_tools import (
     require_equal,
     results_of_both,
 )
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, Uniform
@@ -146,7 +147,7 @@ def test_inputs_outside_of_their_type(probe, make_envs):
         def _get_inputs(self):
             return np.where(self.action > 2, 3e9, 1.0)
 
-    envs = make_envs(Typed, 2, hooks="compiled")
+    envs = make_envs(in_way("arrays", Typed), 2)
     envs.reset(seed=0)
     with pytest.raises(ConfigError, match="expected an integer from"):
         envs.step(np.array([1, 5]))
@@ -166,14 +167,14 @@ def test_outputs_that_overflow_the_default_observation_are_faults(probe, caplog)
         def _get_inputs(self):
             return np.float64(1e40) * self.action
 
-    require_faults_of_the_second(Large, ("compiled", "array"), [[0.0], [1.0], [1e-3]])
+    require_faults_of_the_second(Large, ("arrays"), [[0.0], [1.0], [1e-3]])
 
 
 def require_faults_of_the_second(cls, ways, actions):
     """In the first step of three environments, on both ways; returns the reason."""
     with contextlib.ExitStack() as stack:
         ours, theirs = (
-            stack.enter_context(contextlib.closing(FMUVectorEnv(cls, 3, hooks=hooks)))
+            stack.enter_context(contextlib.closing(FMUVectorEnv(in_way(hooks, cls), 3)))
             for hooks in ways
         )
         (result,) = results_of_both(ours, theirs, [np.array(actions, np.float32)])
@@ -199,13 +200,13 @@ LEFT = {
 def test_only_the_hook_that_cannot_be_traced_leaves_the_pass(hook, mode, caplog):
     cls = type("Partial", (Tracking,), {hook: LEFT[hook]})
     with caplog.at_level("INFO", "fmugym"):
-        assert require_same(cls, steps=20, mode=mode, ways=("auto", "array")) > 20
+        assert require_same(cls, steps=20, mode=mode, ways=("arrays")) > 20
     (record,) = (r for r in caplog.records if "cannot be compiled" in r.getMessage())
     assert record.levelname == "INFO"
     assert f"{hook}, line" in record.getMessage()
     assert "the others are compiled" in record.getMessage()
     with pytest.raises(ConfigError, match=f"cannot be compiled: {hook}"):
-        FMUVectorEnv(cls, 2, hooks="compiled")
+        FMUVectorEnv(in_way("arrays", cls), 2)
 
 
 @in_turn({"hook": list(LEFT), "mode": ["same_step", "disabled"]})
@@ -214,7 +215,9 @@ def test_the_pool_starts_episodes_of_tasks_with_a_hook_that_is_left(
 ):
     """numpy started them, which took two to three times the time of a step."""
     cls = type("Partial", (Tracking,), {hook: LEFT[hook]})
-    ours, theirs = (make_envs(cls, 20, hooks=way, autoreset_mode=mode) for way in ("auto", "array"))
+    ours, theirs = (
+        make_envs(in_way(way, cls), 20, autoreset_mode=mode) for way in ("arrays", "one by one")
+    )
     monkeypatch.setattr(ours.inside.engine, "_begin", None)
     ended = np.zeros(20, np.bool_)
     for result in results_of_both(ours, theirs, 25, same=require_bits):
@@ -231,7 +234,7 @@ def test_faults_of_hooks_that_are_left():
             return np.where(self.action[0] > 0.9, np.inf, np.partition(self.state, 0, axis=0)[0])
 
     actions = [[0.0, 0], [1, 0], [0, 0]]
-    reason = require_faults_of_the_second(Infinite, ("auto", "array"), actions)
+    reason = require_faults_of_the_second(Infinite, ("arrays"), actions)
     assert "_reward_policy returned inf" in reason
 
 
@@ -239,8 +242,8 @@ def test_faults_of_hooks_that_are_left():
 def test_failures_of_the_fmu_are_those_on_arrays(mode, make_envs):
     """Variables, actions and states of the step before stay what they are on arrays."""
     one, other = (
-        make_envs(FailingCart, 50, hooks=hooks, autoreset_mode=mode)
-        for hooks in ("compiled", "array")
+        make_envs(in_way(hooks, FailingCart), 50, autoreset_mode=mode)
+        for hooks in ("arrays", "one by one")
     )
     logging.getLogger("fmugym.FailingCart").setLevel(logging.CRITICAL)
     for _ in results_of_both(one, other, 30, same=require_bits):

@@ -7,6 +7,7 @@ from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from test_single_compiled import require_same, with_hooks
 from vector_tools import Drawing, require_equal, require_pair_equal, sampled_actions
+from ways import in_way
 
 import fmugym
 from fmugym import Uniform
@@ -32,7 +33,7 @@ class Summing(Drawing):
 def test_sums_in_place_are_compiled():
     """``+=`` changes an array in place, where a number is replaced."""
     for mode in AutoresetMode:
-        assert require_pair_equal(Summing, steps=20, mode=mode, hooks="compiled") > 5
+        assert require_pair_equal(Summing, steps=20, mode=mode, way="arrays") > 5
 
 
 class Aliasing(Summing):
@@ -45,9 +46,9 @@ class Aliasing(Summing):
 
 
 def test_a_sum_in_place_that_is_still_read_is_not_taken_for_its_old_value():
-    assert require_pair_equal(Aliasing, hooks="auto") > 5
+    assert require_pair_equal(Aliasing, way="arrays") > 5
     with pytest.raises(fmugym.ConfigError, match="_update"):
-        FMUVectorEnv(Aliasing, 2, hooks="array")
+        FMUVectorEnv(in_way("arrays", Aliasing), 2)
 
 
 class Changing(Drawing):
@@ -75,10 +76,10 @@ class Changing(Drawing):
         return np.stack([0.0 * self.state[0] + part for part in parts])
 
 
-@in_turn({"mode": list(AutoresetMode), "hooks": ["compiled", "array"]})
+@in_turn({"mode": list(AutoresetMode), "hooks": ["arrays"]})
 def test_each_episode_starts_with_the_whole_value(mode, hooks):
     """The first episode and later ones, while others have other types."""
-    assert require_pair_equal(Changing, steps=20, mode=mode, hooks=hooks) > 5
+    assert require_pair_equal(Changing, steps=20, mode=mode, way=hooks) > 5
 
 
 def writing(hook):
@@ -108,16 +109,16 @@ HOOKS = ("_get_inputs", "_is_done", "_is_truncated", "_reward_policy", "_get_obs
 @pytest.mark.parametrize("hook", [*HOOKS, "_get_info"])
 def test_what_another_hook_than_update_writes_is_kept(hook):
     """Only ``_update`` may do so. Where another hook does, no way of calling it may lose that."""
-    assert require_pair_equal(writing(hook), hooks="auto", steps=20) > 5
+    assert require_pair_equal(writing(hook), way="arrays", steps=20) > 5
     if hook != "_get_inputs":
         with pytest.raises(fmugym.ConfigError, match=hook):
-            FMUVectorEnv(writing(hook), 2, hooks="array")
+            FMUVectorEnv(in_way("arrays", writing(hook)), 2)
 
 
 @pytest.mark.parametrize("hook", HOOKS)
 def test_hooks_that_write_variables_are_not_compiled(hook):
     with pytest.raises(fmugym.ConfigError, match="_update"):
-        FMUVectorEnv(writing(hook), 2, hooks="compiled")
+        FMUVectorEnv(in_way("arrays", writing(hook)), 2)
     env = with_hooks(writing(hook), "compiled")
     with env, pytest.raises(fmugym.ConfigError, match="variable"):
         env.reset(seed=1)
@@ -171,7 +172,7 @@ class Mixed(Drawing):
 
 
 def test_before_the_first_action_in_parts_are_zeros():
-    assert require_pair_equal(Mixed, hooks="auto", steps=8) > 0
+    assert require_pair_equal(Mixed, way="arrays", steps=8) > 0
     with Mixed() as env:
         env.reset(seed=1)
         assert env.step(env.action_space.sample())[1] == 0.0
@@ -187,8 +188,8 @@ class Adding(Summing):
 def test_sums_go_on_when_steps_are_compiled_again(make_envs):
     """While one episode has parameters of its own, all steps are done on arrays."""
     ours, theirs = (
-        make_envs(lambda: Adding(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks)
-        for hooks in ("compiled", "per_env")
+        make_envs(in_way(hooks, lambda: Adding(max_episode_steps=50)), 3, autoreset_mode="Disabled")
+        for hooks in ("arrays", "one by one")
     )
     first = np.array([True, False, False])
     overriding = {"reset_mask": first, "model_parameters": {"m": 0.06}}
