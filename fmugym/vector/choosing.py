@@ -58,7 +58,7 @@ def make_engine(
     """
     reason = _reason(prototype)
     if reason is None:
-        task = _programs(prototype) or TaskPrograms.without_programs()
+        task = _programs(prototype) or TaskPrograms.without_programs(prototype.variables)
         return BatchEngine(prototype, pool.num_instances, max_episode_steps, task)
     if pool.num_instances >= _MANY:
         warn_once(logger, f"the hooks of {type(prototype).__name__} are called {reason}")

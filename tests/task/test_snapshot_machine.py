@@ -9,6 +9,7 @@ from combinations import in_turn
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 from test_snapshots import Track
+from ways import in_way
 
 import fmugym
 

@@ -186,6 +186,26 @@ class Drawing(fmugym.FMUEnv):
         return self.state[0] != self.state[0]
 
 
+class Pushed(Drawing):
+    """Two actions and a monitored variable, for hooks of all kinds."""
+
+    space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, **changes):
+        parameters = {"q_0": Uniform(-1.0, 1.0), "q_dot_0": Uniform(-0.5, 0.5)}
+        config = {"model_parameters": parameters, "max_episode_steps": 7}
+        super().__init__(**(config | {"monitor_names": ["theta_ddot"]} | changes))
+
+    def _get_action_space(self):
+        return self.space
+
+    def _get_inputs(self):
+        return [0.01 * np.sum(self.action, axis=0, dtype=np.float64)]
+
+    def _is_done(self):
+        return self.state[0] > 0.8
+
+
 class Remembering(Drawing):
     """Reads everything that a hook may read, with arithmetic that is exact in numpy."""
 

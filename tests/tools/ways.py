@@ -7,7 +7,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from fmugym.task.hooks import Hooks
 from fmugym.task.step import ORDER
-from fmugym.vector import FMUVectorEnv
+from fmugym.vector import FMUVectorEnv, vectorized
 
 ARRAYS, EACH, EXPRESSIONS = "arrays", "one by one", "expressions"
 WAYS = (ARRAYS, EACH)
@@ -59,4 +59,4 @@ def make_vec(way, env_id, num_envs, **options):
     spec = gymnasium.spec(env_id)
     make = functools.partial(load_env_creator(spec.entry_point), **spec.kwargs)
     options = {"max_episode_steps": spec.max_episode_steps} | options
-    return many(make, num_envs, way=way, **options)
+    return vectorized(in_way(way, make))(num_envs, **options)

@@ -5,13 +5,15 @@ from functools import partial
 import numpy as np
 import pytest
 from letters import wide
-from test_rollouts import WAYS, rows_of
+from test_rollouts import WAYS as OF_CLASSES
+from test_rollouts import rows_of
 from test_snapshots import Track
 from ways import in_way
 
 import fmugym
 from fmugym import ConfigError
 
+WAYS = {"expressions": {}, **OF_CLASSES}
 HOUR, DT, STEPS, N = 3600.0, 600.0, 20, 3
 TIMES = np.arange(24) * HOUR
 OWN = np.linspace(0.0, 0.023, 24)
@@ -180,16 +182,6 @@ class TestOffsets:
         envs = environments(spinning())
         with pytest.raises(ConfigError, match=reason):
             envs.rollout(root(spinning())[0], pushes(), offsets=offsets)
-
-    def test_do_not_reach_a_step_of_a_class(self, vector_of):
-        class Own(Track):
-            def step(self, action):
-                return super().step(action)
-
-        envs = vector_of(Own, 2)
-        envs.reset(seed=0)
-        with pytest.raises(ConfigError, match="a step of its own"):
-            envs.rollout(None, np.zeros((2, 3, 1)), offsets={"q": 1.0})
 
 
 class TestSeed:

@@ -45,9 +45,7 @@ def test_attributes_for_each_environment(hooks):
 
 
 @pytest.mark.parametrize("values", [[0.5, 1.5, -2.0], [1, 2, 3], [True, False, True], [2.0] * 3])
-def test_hooks_stay_compiled_with_attributes_for_each_environment(values):
-    """They ran on arrays until now. The program reads the values as it reads a parameter's."""
-
+def test_hooks_read_attributes_of_each_environment(values):
     class Weighted(Drawing):
         weight = 1.0
 
@@ -61,7 +59,6 @@ def test_hooks_stay_compiled_with_attributes_for_each_environment(values):
         list(results_of_both(*ways, 5))
         for vector in ways:
             assert vector.get_attr("weight") == tuple(now)
-    assert [vector.inside.engine.way for vector in ways] == ["arrays"]
     for vector in ways:
         vector.close()
 
@@ -162,9 +159,6 @@ class Limited(CART_POLE):
         self.limit = self.limit / 2
         self.step_count = 0
 
-    def mark(self, value):
-        self.marks.append(value)
-
     def name_it(self, name):
         self.name = name
 
@@ -199,8 +193,6 @@ def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing(m
     vector.step(np.zeros(3, np.int64))
     with pytest.raises(ConfigError, match="'step_count' cannot be set"):
         vector.call("halve_and_stop")
-    with pytest.raises(ConfigError, match=r"self\.marks in place"):
-        vector.call("mark", 1.0)
     assert vector.get_attr("limit") == (2.4,) * 3
     assert vector.get_attr("marks") == ([0.0],) * 3
     vector.call("name_it", "trolley")

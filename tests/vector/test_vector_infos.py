@@ -15,7 +15,7 @@ from vector_tools import (
     require_equal,
     sampled_actions,
 )
-from ways import in_way, make_vec
+from ways import in_way, make_vec, many
 
 import fmugym
 

@@ -2,12 +2,11 @@
 
 import threading
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from combinations import in_turn
 from vector_tools import HOOKS, Drawing, require_equal, require_pair_equal
-from ways import in_way
+from ways import in_way, make_vec
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -162,10 +161,7 @@ class Failing(Drawing):
 
 
 @in_turn({"mode": ["next_step", "same_step", "disabled"], "hooks": ["arrays", "one by one"]})
-def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(
-    hooks, mode, monkeypatch, make_envs
-):
-    monkeypatch.setattr("fmugym.vector.choosing.find_difference", lambda env: None)
+def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(hooks, mode, make_envs):
     vector = make_envs(in_way(hooks, Failing), 3, autoreset_mode=mode)
     first = vector.reset(seed=1)[0]
     vector.step(NOTHING)
@@ -190,7 +186,9 @@ class FailingEarly(Drawing):
 @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_an_exception_before_the_step_leaves_the_episodes(hooks, make_envs):
     vector, twin = (make_envs(in_way(hooks, FailingEarly), 3) for _ in range(2))
-    vector.reset(seed=1), twin.reset(seed=1)
+    for envs in (vector, twin):
+        envs.reset(seed=1)
+        envs.step(NOTHING)
     with pytest.raises(ZeroDivisionError):
         vector.step(np.array([[0.0], [0.006], [0.0]], np.float32))
     require_equal(vector.step(NOTHING)[0], twin.step(NOTHING)[0])
@@ -198,7 +196,7 @@ def test_an_exception_before_the_step_leaves_the_episodes(hooks, make_envs):
 
 def test_bundled_ids_take_any_number():
     """The environments of one vector environment share the FMU that they open."""
-    envs = gym.make_vec("fmugym/Pendulum-v0", num_envs=20, way="one by one")
+    envs = make_vec("one by one", "fmugym/Pendulum-v0", 20)
     assert len({id(fmu) for fmu in envs.get_attr("fmu")}) == 1
     envs.close()
     assert fmugym.bundled_fmu("Pendulum").exists()

@@ -117,6 +117,6 @@ def test_a_recorded_series_tells_the_state_before(hooks, pair):
 
 def test_before_the_first_reset(make_envs):
     """There is no last step: the values are those of a new environment."""
-    envs = make_envs(Told, 2)
+    envs = make_envs(Told, 2, way="arrays")
     assert plain(envs.get_attr("step_count")) == [0, 0]
     assert plain(envs.get_attr("previous_action")) == [[0.0], [0.0]]

@@ -129,7 +129,7 @@ def test_a_distribution_for_each_element(hooks, mode):
 @in_turn({"mode": list(AutoresetMode), "hooks": HOOKS})
 def test_elements_that_only_python_can_draw(hooks, mode):
     variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
-    options = {"num_envs": 3, "hooks": hooks, "variables": variables}
+    options = {"num_envs": 3, "way": hooks, "variables": variables}
     assert require_pair_equal(Targets, 12, mode, **options) >= 6
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_threads import MANY, call_at_once, interrupt, run_together
 from vector_tools import results_of_both
-from ways import in_way
+from ways import in_way, many
 
 from fmugym import SimulationError
 from fmugym.envs import CartPoleEnv

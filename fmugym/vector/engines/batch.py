@@ -134,7 +134,9 @@ class BatchEngine(Engine):
             self._limit,
             (StepResult, *layout.form, layout.shapes, late_info(draws)),
         )
-        has_all_starts = native is not None and task.variables.keys() == env.variables.keys()
+        starts, rows = env.config.episode_variables, memory.variables
+        fit = all(np.shape(start) == rows[n].shape[:-1] for n, start in starts.items())
+        has_all_starts = native is not None and fit
         is_free = env.inside.warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
         self._are_hooks_tried = False
@@ -587,6 +589,7 @@ class BatchEngine(Engine):
         read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
             self._write_inputs(self._pool.inputs, resetting)
+            self._keep_variables()
         except Exception as error:
             self._blame_arrays(error)
             raise
@@ -648,6 +651,7 @@ class BatchEngine(Engine):
             infos = result.infos
             if inside.has_info:
                 infos = self._infos(np.ones(self._n, _BOOL)) | infos
+            self._keep_variables()
             self._are_hooks_tried = True
         except Exception as error:
             self._blame_arrays(error)
@@ -697,27 +701,44 @@ class BatchEngine(Engine):
         return hook_results.rewards(value, self._n)
 
     def update(self, env: Hooks) -> None:
-        """Call the hook, but keep the variables of environments that did not step.
-
-        Values that it assigns are copied, because the next step may overwrite their array.
-        """
-        variables = env.variables
-        before = {name: self._row(name) for name in variables}
-        self._memory.before = {name: row.copy() for name, row in before.items()}
+        """Call the hook, but keep the variables of environments that did not step."""
         env._update()
-        for name, row in before.items():
-            if variables[name] is not row:
-                variables[name] = self._kept_variable(name, variables[name])
+        self._keep_variables()
         if self._idle is not None and self._idle.any():
             self._restore_variables(self._idle)
 
-    def _kept_variable(self, name: str, value: Any) -> npt.NDArray[Any]:
-        row = hook_results.variable(name, value, self._n)
-        if row.dtype == np.float64:
-            return row
-        return row.astype(
-            hook_results.type_of_variable(self.env.inside.draws, name, row.dtype), copy=False
-        )
+    def _keep_variables(self) -> None:
+        """Copy what hooks have assigned to the arrays that the pool keeps, or make others."""
+        variables, held = self.env.variables, self._memory.variables
+        assigned = [name for name, row in held.items() if variables[name] is not row]
+        if not assigned:
+            return
+        values = {name: self._value_of(name, variables[name]) for name in assigned}
+        for name, value in values.items():
+            row = held[name]
+            if value.dtype == row.dtype and value.shape == row.shape:
+                row[...] = value
+                values[name] = row
+        variables.update(values)
+        others = {n: v.dtype for n, v in values.items() if v is not held[n]}
+        if others:
+            before = dict(self._memory.before)
+            self._prepare(replace(self._task, variables={**self._task.variables, **others}))
+            self._memory.take_back(before)
+
+    def _value_of(self, name: str, value: Any) -> npt.NDArray[Any]:
+        """A value of a variable as an array of its own, in the type that it is kept in."""
+        row = self._memory.variables[name]
+        if type(value) is np.ndarray and value.dtype == row.dtype and value.shape == row.shape:
+            return value if value.base is None and not self._holds(value) else value.copy()
+        array = hook_results.variable(name, value, self._n)
+        if array.dtype == np.float64:
+            return array
+        dtype = hook_results.type_of_variable(self.env.inside.draws, name, array.dtype)
+        return array.astype(dtype, copy=False)
+
+    def _holds(self, value: npt.NDArray[Any]) -> bool:
+        return any(value is row for row in self._memory.variables.values())
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._memory.before.items():

@@ -20,7 +20,7 @@ from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.actions import take_action
-from fmugym.task.construction import draws_of, prepare_hooks
+from fmugym.task.construction import draws_of, draws_of_reset, prepare_hooks
 from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
@@ -120,6 +120,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.reset``."""
         infos: dict[int, dict[str, Any]] = {}
         self.has_moved = False
+        draws_of_reset(self._envs[0], options, "reset_mask")  # it refuses unknown options
         for index in np.flatnonzero(mask).tolist():
             seed = None if seeds is None else seeds[index]
             observation, infos[index] = self._reset(index, seed, options)

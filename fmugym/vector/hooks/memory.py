@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,12 @@ class Memory:
             self.variables[name] = np.ascontiguousarray(row, dtype).copy()
             self.before[name] = self.variables[name].copy()
         self.show()
+
+    def take_back(self, before: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Keep what the variables were before the step, in other types and shapes than now."""
+        every = np.ones(self._n, np.bool_)
+        for name, values in before.items():
+            hook_results.restore_variable(name, self.before[name], every, values)
 
     def show(self) -> None:
         """Let hooks on arrays read what the pool keeps."""
@@ -128,6 +134,10 @@ class Memory:
         arrays = self.variables if kind == "variable" else self.before
         return arrays[name].reshape(-1, self._n)[index]
 
+    def _elements(self, name: str, start: Any) -> npt.NDArray[Any]:
+        """The start value of each element of a variable."""
+        return np.broadcast_to(start, self.variables[name].shape[:-1]).reshape(-1)
+
     def _action_group(self) -> dict[str, Any]:
         """How the pool checks and keeps actions."""
         env, dtype = self._env, self.actions[0].dtype
@@ -183,7 +193,7 @@ class Memory:
                 (row, np.array(value, row.dtype).tobytes())
                 for name, start in constants.items()
                 if name in flat
-                for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
+                for row, value in zip(flat[name], self._elements(name, start), strict=True)
             ),
             "results": results,
         }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -55,13 +55,18 @@ class TaskPrograms:
     is_compiled: bool = True
 
     @classmethod
-    def without_programs(cls) -> TaskPrograms:
-        """A task whose hooks run on arrays; a program only passes on that an FMU stops."""
+    def without_programs(cls, variables: Iterable[str]) -> TaskPrograms:
+        """A task whose hooks run on arrays; a program only passes on that an FMU stops.
+
+        Args:
+            variables: The names of the episode variables, which are float64 at first.
+        """
         graph, flag = Graph(), np.dtype(np.bool_)
         stopped = graph.load("stopped", None, flag, None)
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
         judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
-        return cls(compile_graph(Graph(), [], [], 0), judgement, (), {}, (), is_compiled=False)
+        types = dict.fromkeys(variables, np.dtype(np.float64))
+        return cls(compile_graph(Graph(), [], [], 0), judgement, (), types, (), is_compiled=False)
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TaskPrograms:
         """The same task with other tables, by the bytes of those whose place they take."""
