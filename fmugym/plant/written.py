@@ -41,7 +41,9 @@ class Written:
         self.actions = Actions(env, self._range_of, math.inf)
         self._own = env._get_inputs
         # the hook of this one environment, whatever its class
-        env._get_inputs = self._get_inputs  # type: ignore[method-assign]
+        hook, (_, functions) = self._get_inputs, env.inside.formulas
+        env.inside.formulas = None, {**functions, "_get_inputs": hook}
+        env._get_inputs = hook  # type: ignore[method-assign]
         if env.inside.warm_ups is not None:
             warm_up = env.inside.warm_ups.warm_up
             self._of_warm_up = warm_up.inputs

@@ -117,6 +117,8 @@ class TestDifferences:
         gain = 0.01
 
         class Damped(Precise):
+            vectorized = True
+
             def _get_inputs(self):
                 return 0.5 * self.action - gain * self.out["q_dot"]
 

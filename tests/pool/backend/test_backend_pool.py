@@ -469,12 +469,6 @@ class TestVector:
         del gym.registry["test/Rig-v0"]
 
 
-def test_hooks_of_a_single_real_plant_are_not_compiled():
-    env = fmugym.envs.CartPoleEnv(way="arrays", backend=Oscillator())
-    with env, pytest.raises(ConfigError, match="the pool is not a native one"):
-        env.reset()
-
-
 @in_turn({"hooks": ["arrays", "one by one"], "mode": list(AutoresetMode)})
 def test_hooks_of_several_real_plants(hooks, mode):
     """Programs run around the steps of the rigs; each way gives what single environments do."""
