@@ -83,7 +83,7 @@ class _Row:
 
     kind: Kind
     readings: Readings
-    before: Mapping[str, Any]
+    before: dict[str, Any]
     done: bool
 
 
@@ -103,6 +103,7 @@ def find_difference(env: FMUEnv) -> str | None:
         warnings.simplefilter("ignore")
         rng = np.random.default_rng(0)
         rows = list(_rows(env, rng))
+        _spread_variables(rows)
         limits = list(_at_limits(env, [one for one in rows if one.kind == "step"], rng))
         for name in hooks:
             try:
@@ -189,6 +190,15 @@ def _variables(values: Mapping[str, Any]) -> EpisodeVariables:
     variables = EpisodeVariables(values)
     variables.update({name: np.copy(one) if np.ndim(one) else one for name, one in values.items()})
     return variables
+
+
+def _spread_variables(rows: Sequence[_Row]) -> None:
+    """Give each variable the shape that it has in later steps everywhere."""
+    for name in rows[0].readings.variables:
+        held = [part for row in rows for part in (row.readings.variables, row.before)]
+        shape = np.broadcast_shapes(*(np.shape(part[name]) for part in held))
+        for part in held if shape else ():
+            part[name] = np.array(np.broadcast_to(part[name], shape))
 
 
 def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
@@ -291,8 +301,8 @@ def _batch_of(env: FMUEnv, rows: Sequence[_Row], name: str) -> Readings:
         batch.previous_action[..., index] = one.previous_action
         batch.done[index] = one.done
     for variable in batch.variables:
-        values = np.broadcast_arrays(*(one.variables[variable] for one in states))
-        batch.variables[variable] = np.moveaxis(np.array(values), 0, -1).copy()
+        values = np.array([one.variables[variable] for one in states])
+        batch.variables[variable] = np.moveaxis(values, 0, -1).copy()
     names = states[0].parameters
     batch.parameters = MappingProxyType(
         ParameterValues((n, _array_of([one.parameters[n] for one in states])) for n in names)
