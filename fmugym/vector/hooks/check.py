@@ -32,7 +32,7 @@ from fmugym.vector.codec import mapped
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.views import batched, column
 
-__all__ = ["CURE", "find_difference", "sample_of"]
+__all__ = ["CURE", "find_difference", "own_hooks"]
 
 CURE: Final = (
     "Write hooks element-wise: & and | for 'and' and 'or', numpy.where for 'if', no reduction over "
@@ -96,7 +96,7 @@ def find_difference(env: FMUEnv) -> str | None:
     Returns:
         The hook and what is wrong with it, or None.
     """
-    hooks = [name for name in ORDER if _is_own(env, name)]
+    hooks = own_hooks(env)
     if not hooks:
         return None
     with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -113,6 +113,11 @@ def find_difference(env: FMUEnv) -> str | None:
             except _DifferenceError as difference:
                 return f"{name} {difference}"
     return None
+
+
+def own_hooks(env: FMUEnv) -> list[str]:
+    """The hooks of a step that classes override."""
+    return [name for name in ORDER if _is_own(env, name)]
 
 
 def _is_own(env: FMUEnv, name: str) -> bool:
@@ -155,7 +160,7 @@ def _episode(env: FMUEnv, rng: np.random.Generator, *, at_ends: bool) -> list[_R
     env.reset(seed=int(rng.integers(2**31)))
     rows, variables = [_row_of(env, "start", dict(env.variables))], dict(env.variables)
     for _ in range(_STEPS):
-        action = sample_of(env.action_space, rng)
+        action = _sample_of(env.action_space, rng)
         try:
             *_, terminated, truncated, info = env.step(_at_end(env.action_space, action, at_ends))
         except FMUGymError:
@@ -212,8 +217,8 @@ def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
             values=values,
             previous_state=tuple(rng.normal(size=env.inside.output_count).tolist()),
             inputs=tuple(rng.normal(size=len(now.inputs)).tolist()),
-            action=np.array(sample_of(env.action_space, rng)),
-            previous_action=np.array(sample_of(env.action_space, rng)),
+            action=np.array(_sample_of(env.action_space, rng)),
+            previous_action=np.array(_sample_of(env.action_space, rng)),
             step_count=index,
             parameters=MappingProxyType(ParameterValues(episode.parameters)),
             variables=variables,
@@ -241,7 +246,7 @@ def _ends_of(variable: Variable) -> tuple[float, float]:
     return variable.minimum, variable.maximum
 
 
-def sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
+def _sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
     """Sample without touching the space's own generator."""
     own, space._np_random = space._np_random, rng
     try:
