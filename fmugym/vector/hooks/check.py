@@ -28,6 +28,7 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.results import as_flag, as_info, as_reward
 from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, ParameterValues
+from fmugym.vector.calls import take_back
 from fmugym.vector.codec import mapped
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.views import batched, column
@@ -432,8 +433,7 @@ class _Comparison:
         except Exception as error:  # hooks may raise anything
             raise _FailureError(f"{type(error).__name__}: {error}") from error
         finally:
-            vars(env).clear()
-            vars(env).update(attributes)
+            take_back(env, attributes)
 
     # The results
 
