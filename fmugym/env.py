@@ -244,8 +244,8 @@ class FMUEnv(Constructed):
                 and, with ``on_fault="raise"``, after a fault.
         """
         player = self.inside.player
-        if player is not None and self.render_mode is None:
-            result: Result | None = player.step(action)
+        if self.render_mode is None:
+            result = self._step_in_python(action) if player is None else player.step(action)
             if result is not None:
                 return result
         return FMUEnv._step(self, action)

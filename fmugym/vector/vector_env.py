@@ -332,7 +332,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Start the next episodes in the step that ended some, where the engine has not."""
         last = last_observations(self.single_observation_space, result.observations, ended)
-        observations, infos = self.inside.engine.reset(ended, None, {})
+        engine = self.inside.engine
+        started = engine.reset_by({"reset_mask": ended})
+        observations, infos = engine.reset(ended, None, {}) if started is None else started
         infos |= final_infos(last, restricted(result.infos, ended), ended)
         infos = merged(restricted(result.infos, ~ended), infos)
         return result._replace(observations=observations, infos=infos)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from math import isfinite
 from traceback import walk_tb
 from types import MappingProxyType, MethodType
 from typing import Any
@@ -92,6 +93,8 @@ class BatchEngine(Engine):
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
         self._idle: MaskArray | None = None
+        self._busy: MaskArray | None = None
+        self._all = np.ones(num_envs, np.bool_)
         self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env.inside.was_reset = True  # for the calls on single environments
@@ -586,7 +589,7 @@ class BatchEngine(Engine):
         env, read = self.env, self.env.inside.readings
         before = read.action, read.previous_action, read.previous_state
         read.previous_action, read.action = read.action, environments_last(actions)
-        read.previous_state, env.inside.in_hooks = read.state.copy(), True
+        read.previous_state, env.inside.in_hooks = read.state, True
         try:
             self._write_inputs(self._pool.inputs, resetting)
             self._keep_variables()
@@ -611,9 +614,9 @@ class BatchEngine(Engine):
         return [i for i in range(self._n) if resetting is None or not resetting[i]]
 
     def _require_finite(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
-        finite = np.isfinite(inputs)
-        if np.count_nonzero(finite) == finite.size:  # a third of the time of all()
+        if isfinite(np.vdot(inputs, inputs)):  # half the time of what follows
             return
+        finite = np.isfinite(inputs)
         for index in self._stepping(resetting):
             if not finite[:, index].all():
                 raise ConfigError(
@@ -626,7 +629,9 @@ class BatchEngine(Engine):
         """Call the hooks if programs have not done their work, and handle faults."""
         if self._calls_hooks:
             result = self._concluded(result, troubled, started)
-        rewards, observations = not_finite(result.rewards), not_finite(result.observations)
+        rewards = not_finite(result.rewards)
+        is_told = self.env.inside.pool_observes and not troubled
+        observations = None if is_told else not_finite(result.observations)
         if troubled or rewards is not None or observations is not None:
             self._mend(result, started, (rewards, observations))
         return result
@@ -636,9 +641,10 @@ class BatchEngine(Engine):
     ) -> StepResult:
         """Call the hooks that follow the FMUs' step."""
         env, inside = self.env, self.env.inside
-        self._idle = failed_in(self._pool.statuses) if troubled else None
+        idle = failed_in(self._pool.statuses) if troubled else None
         if started is not None:
-            self._idle = started if self._idle is None else self._idle | started
+            idle = started if idle is None else idle | started
+        self._idle, self._busy = idle, None if idle is None else ~idle
         observed = result.observations if inside.pool_observes else None
         inside.in_hooks = True
         try:
@@ -650,7 +656,7 @@ class BatchEngine(Engine):
                 seen = hook_results.observations(seen, env.observation_space, self._n)
             infos = result.infos
             if inside.has_info:
-                infos = self._infos(np.ones(self._n, _BOOL)) | infos
+                infos = self._infos(self._all) | infos
             self._keep_variables()
             self._are_hooks_tried = True
         except Exception as error:
@@ -658,9 +664,11 @@ class BatchEngine(Engine):
             raise
         finally:
             inside.in_hooks = False
-        if started is not None:
-            terminated[started] = truncated[started] = False
-            rewards[started] = 0.0
+        if started is not None:  # a third of the time of assignments with a mask
+            running = self._busy if idle is started else ~started
+            terminated &= running
+            truncated &= running
+            np.copyto(rewards, 0.0, where=started)
         self._memory.keep_done(terminated)
         self.note_ends(terminated, truncated)
         return StepResult(seen, rewards, terminated, truncated, infos)
@@ -694,8 +702,8 @@ class BatchEngine(Engine):
     def flags(self, hook: str, value: Any) -> MaskArray:
         """See ``Form.flags``; nothing is done where the FMU has not stepped."""
         found = hook_results.flags(hook, value, self._n)
-        if self._idle is not None and hook == "_is_done":
-            found[self._idle] = False
+        if self._busy is not None and hook == "_is_done":
+            found &= self._busy
         return found
 
     def rewards(self, value: Any) -> FloatArray:
@@ -715,24 +723,29 @@ class BatchEngine(Engine):
         assigned = [name for name, row in held.items() if variables[name] is not row]
         if not assigned:
             return
-        values = {name: self._value_of(name, variables[name]) for name in assigned}
-        for name, value in values.items():
+        others: dict[str, np.dtype[Any]] = {}
+        values = [self._value_of(name, variables[name], len(assigned)) for name in assigned]
+        for name, value in zip(assigned, values, strict=True):
             row = held[name]
             if value.dtype == row.dtype and value.shape == row.shape:
-                row[...] = value
-                values[name] = row
-        variables.update(values)
-        others = {n: v.dtype for n, v in values.items() if v is not held[n]}
+                np.copyto(row, value)
+                dict.__setitem__(variables, name, row)  # it needs no check
+            else:
+                variables[name], others[name] = value, value.dtype
         if others:
             before = dict(self._memory.before)
             self._prepare(replace(self._task, variables={**self._task.variables, **others}))
             self._memory.take_back(before)
 
-    def _value_of(self, name: str, value: Any) -> npt.NDArray[Any]:
-        """A value of a variable as an array of its own, in the type that it is kept in."""
+    def _value_of(self, name: str, value: Any, count: int) -> npt.NDArray[Any]:
+        """A value of a variable in the type that it is kept in.
+
+        If more than one are assigned, it is an array that the others do not write.
+        """
         row = self._memory.variables[name]
         if type(value) is np.ndarray and value.dtype == row.dtype and value.shape == row.shape:
-            return value if value.base is None and not self._holds(value) else value.copy()
+            is_apart = count == 1 or (value.base is None and not self._holds(value))
+            return value if is_apart else value.copy()
         array = hook_results.variable(name, value, self._n)
         if array.dtype == np.float64:
             return array
@@ -858,7 +871,7 @@ class BatchEngine(Engine):
             )
         copy_rows(again, result.observations, mask)
         if self.env.inside.has_info:
-            infos = self._infos(np.ones(self._n, np.bool_))
+            infos = self._infos(self._all)
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 
 
