@@ -409,8 +409,10 @@ class FMUEnv(Constructed):
     @property
     def observation_names(self) -> tuple[str, ...] | None:
         """The names of the observation's elements; None if a hook of the class makes it."""
-        is_default = type(self)._get_observation is FMUEnv._get_observation
-        return tuple(v.name for v in self.inside.interface.outputs) if is_default else None
+        if type(self)._get_observation is not FMUEnv._get_observation:
+            return None
+        expressions = tuple(one.text for one in self.config.observations)
+        return expressions or tuple(v.name for v in self.inside.interface.outputs)
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
