@@ -73,7 +73,8 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
 
 
 def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
-    _require_array(observed)
+    if not isinstance(observed, spaces.Box):
+        raise ConfigError(f"a policy that observes {observed} cannot be exported; a Box can be")
     if policy.choices and policy.masks is not None:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
     controller, past = policy.baseline, policy.starts
@@ -98,14 +99,6 @@ def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
         return policy.action_of(action), [*now, *states]
 
     return Decision(network, decide, starts)
-
-
-def _require_array(observed: spaces.Space[Any]) -> None:
-    parts = observed.spaces.values() if isinstance(observed, spaces.Dict) else [observed]
-    if not all(isinstance(part, spaces.Box) for part in parts):
-        raise ConfigError(
-            f"a policy that observes {observed} cannot be exported; a Box can be, or a Dict"
-        )
 
 
 def _network_of(policy: Policy) -> Network | None:
