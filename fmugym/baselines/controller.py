@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
+from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -14,6 +15,9 @@ from gymnasium.vector import VectorEnv
 
 from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.expressions.by_numpy import function_of
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.value import Value, where
 
 __all__ = [
     "Controller",
@@ -22,6 +26,8 @@ __all__ = [
     "Signal",
     "attribute_of",
     "check_numbers",
+    "either",
+    "limited",
     "require_physical",
 ]
 
@@ -34,7 +40,10 @@ Signal = str | Numbers
 """An element of the observation by name, or a constant."""
 
 
-MakeSignal = Callable[[str, Sequence[str]], Callable[[Any], Any]]
+Formula = Callable[[Sequence[Value]], Value]
+"""A function of the elements of an observation."""
+
+MakeSignal = Callable[[str, Sequence[str]], Formula]
 """See ``Inside.signal_of``."""
 
 
@@ -52,7 +61,7 @@ class Controller(KnownArguments, ABC):
 
     is_physical: ClassVar[bool] = True
     _make_signal: MakeSignal | None
-    _signals: dict[str, Callable[[Any], Any]]
+    _signals: dict[str, tuple[Formula, Callable[[Any], Any]]]
 
     space: spaces.Space[Any]
     names: tuple[str, ...]
@@ -124,6 +133,27 @@ class Controller(KnownArguments, ABC):
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         """Forget the episodes of some environments."""
 
+    def decision(
+        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        """The formulas of a decision, of a controller of one environment.
+
+        Args:
+            observation: Its elements, as float64.
+            memory: The numbers that it remembers.
+
+        Returns:
+            The elements of the action, before they are limited, and the numbers that it remembers
+            then.
+
+        Raises:
+            ConfigError: If there are no such formulas.
+        """
+        raise ConfigError(
+            f"a controller of type {type(self).__name__} cannot be exported; a PID, a Hysteresis "
+            "and an LQR can be"
+        )
+
     def _names_of(self, env: Any) -> tuple[str, ...]:
         """The names of what the environment lets observe."""
         names: tuple[str, ...] | None = attribute_of(env, "observation_names")
@@ -150,9 +180,17 @@ class Controller(KnownArguments, ABC):
     def _column(self, rows: FloatArray, signal: Signal) -> FloatArray:
         """The values of a signal, shape (N,)."""
         if isinstance(signal, str):
-            signals: FloatArray = self._signals[signal](rows)
+            _, evaluate = self._signals[signal]
+            signals: FloatArray = evaluate(rows)
             return signals
         return np.full(len(rows), signal)
+
+    def _formula(self, observation: Sequence[Value], signal: Signal) -> Value:
+        """The value of a signal."""
+        if isinstance(signal, str):
+            formula, _ = self._signals[signal]
+            return formula(observation)
+        return observation[0].beside(signal)
 
     def _check_signal(self, what: str, signal: Signal) -> None:
         """Check a signal; one that is no name may be an expression, if a task is declared."""
@@ -160,10 +198,12 @@ class Controller(KnownArguments, ABC):
             self._check_size(what, check_numbers(what, signal))
         elif self._make_signal is None or signal.isidentifier() or self._is_name(signal):
             self._check_name(what, signal)
-            self._signals[signal] = itemgetter((slice(None), self._place_of(signal)))
+            place = self._place_of(signal)
+            self._signals[signal] = itemgetter(place), itemgetter((slice(None), place))
         else:
             try:
-                self._signals[signal] = self._make_signal(signal, self.names)
+                formula = self._make_signal(signal, self.names)
+                self._signals[signal] = formula, _of_rows(formula, len(self.names))
             except ConfigError as error:
                 raise ConfigError(f"{what}: {error}") from None
 
@@ -209,6 +249,20 @@ class Controller(KnownArguments, ABC):
             values = limited(values, space.low, space.high)
         return values.astype(space.dtype)
 
+    def action_of(self, values: Sequence[Value]) -> list[Value]:
+        """The elements of an action as ``act`` returns them: limited, and in the space's type.
+
+        Args:
+            values: The elements before that.
+        """
+        space: Any = self.space
+        if isinstance(space, spaces.Discrete):
+            values = [limited(np.rint(one), *self._limits()) for one in values]
+        elif isinstance(space, spaces.Box):
+            limits = zip(values, space.low.flat, space.high.flat, strict=True)
+            values = [limited(one, low, high) for one, low, high in limits]
+        return [one.cast(space.dtype) for one in values]
+
     def _shape(self) -> str:
         width = len(self.names)
         return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
@@ -221,9 +275,30 @@ def _maker_of_signals(env: Any) -> MakeSignal | None:
     return make
 
 
+def _of_rows(formula: Formula, width: int) -> Callable[[Any], Any]:
+    """The function of observations of shape (N, k) that returns a signal of shape (N,)."""
+    graph = Graph()
+    value = formula([Value.read(graph, "columns", place) for place in range(width)])
+    constant = value.constant
+    if constant is not None:
+        return lambda rows: np.full(len(rows), float(constant))
+    evaluate = function_of(value)
+    return lambda rows: evaluate(SimpleNamespace(columns=rows.T))
+
+
 def limited(values: Any, low: Any, high: Any) -> Any:
-    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers."""
+    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers.
+
+    Formulas are limited alike.
+    """
     return np.minimum(np.maximum(values, low), high)
+
+
+def either(condition: Any, first: Any, second: Any) -> Any:
+    """Do what ``numpy.where`` does, of formulas, too."""
+    if isinstance(condition, Value):
+        return where(condition, first, second)
+    return np.where(condition, first, second)
 
 
 def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:

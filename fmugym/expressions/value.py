@@ -25,12 +25,17 @@ _MOST_NODES: Final = 150_000
 """A forecast of 2000 values with errors that grow and last, normalized, takes some 110,000."""
 
 _DOUBLE: Final = np.dtype(np.float64)
+_SINGLE: Final = np.dtype(np.float32)
 _INTEGER: Final = np.dtype(np.int64)
 _FLAG: Final = np.dtype(np.bool_)
 
 
 def _operator(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
     return lambda own, other: own.applied(ufunc, own, other)
+
+
+def _reflected(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
+    return lambda own, other: own.applied(ufunc, other, own)
 
 
 class Value:
@@ -123,9 +128,9 @@ class Value:
         return Value(self.graph, self.graph.compute(kind, table, (self.cell,), dtype, None))
 
     __add__ = __radd__ = _operator(np.add)
-    __sub__, __mod__ = _operator(np.subtract), _operator(np.remainder)
+    __sub__, __rsub__ = _operator(np.subtract), _reflected(np.subtract)
     __mul__ = __rmul__ = _operator(np.multiply)
-    __truediv__ = _operator(np.divide)
+    __truediv__, __mod__ = _operator(np.divide), _operator(np.remainder)
     __lt__, __gt__ = _operator(np.less), _operator(np.greater)
     __le__, __ge__ = _operator(np.less_equal), _operator(np.greater_equal)
     # Comparisons make nodes instead of bools, and so there is no hash.
@@ -133,6 +138,9 @@ class Value:
     __and__, __or__ = _operator(np.bitwise_and), _operator(np.bitwise_or)
     __xor__, __rshift__ = _operator(np.bitwise_xor), _operator(np.right_shift)
     __hash__ = None  # type: ignore[assignment]
+
+    def __neg__(self) -> Value:
+        return self.applied(np.negative, self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *operands: Any, **keywords: Any) -> Any:
         if method != "__call__" or keywords:
@@ -168,6 +176,8 @@ def _loop_of(
 def _type_of(number: float | bool) -> np.dtype[Any]:
     if isinstance(number, bool | np.bool_):
         return _FLAG
+    if isinstance(number, np.float32):
+        return _SINGLE
     return _INTEGER if isinstance(number, int | np.integer) else _DOUBLE
 
 

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from contextlib import closing, contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -16,6 +17,7 @@ from fmpy import extract, read_model_description
 from fmpy.simulation import apply_start_values, instantiate_fmu
 from gymnasium import spaces
 
+import fmugym
 from fmugym.export import Activation, Layer, Network, Scaling, agent_of, write_c, write_onnx
 
 FLAGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off")
@@ -26,10 +28,7 @@ def network_for(env, hidden=(16, 16), scaled=True, squashed=False, seed=0, activ
     """A network with random weights for the spaces of an environment."""
     rng = np.random.default_rng(seed)
     space = env.action_space
-    count = sum(
-        int(np.prod(s.shape))
-        for s in getattr(env.observation_space, "spaces", {"": env.observation_space}).values()
-    )
+    count = int(np.prod(env.observation_space.shape))
     if isinstance(space, spaces.Box):
         last = int(np.prod(space.shape))
     else:
@@ -70,9 +69,16 @@ TIMES = {
 """When its episodes begin."""
 
 
-def made(env_id):
-    """A registered environment without wrappers."""
-    return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
+ROOT = Path(__file__).parents[2]
+FILES = {"CartPole": "examples/cart_pole.toml", "Pendulum": "tests/golden/tasks/pendulum.toml"}
+"""Tasks that are those of registered environments."""
+
+
+def made(name):
+    """The environment of a task file, or a registered one without wrappers."""
+    if name in FILES:
+        return fmugym.load(ROOT / FILES[name])
+    return gymnasium.make(f"fmugym/{name}-v0").unwrapped
 
 
 def agent_named(name="agent", seed=0):
