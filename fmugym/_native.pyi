@@ -250,9 +250,7 @@ class Pool:
         self,
         judge: Callable[[], Any],
         complete: Callable[[Any], Any] | None,
-        watched: tuple[Any, ...],
         action: Any,
-        environment: Any,
         /,
     ) -> Any:
         """Do a whole step of a single environment, by a pool of one.
@@ -261,16 +259,12 @@ class Pool:
             judge: Returns the result if the instance has stepped, but its status or a number is not
                 good.
             complete: Makes the result of a good step whole; None if it is that already.
-            watched: The attributes that the programs were made of: names and values after each
-                other. An ellipsis stands for one that must not be there.
             action: Of the environment.
-            environment: Whose attributes are compared.
 
         Returns:
             The result of the step: a tuple of the class that ``prepare_play`` has got. None if
             nothing was done: the episode has ended, the action is not of the type that was
-            prepared, an attribute has changed, or inputs are not finite. An exception ends the
-            episode.
+            prepared, or inputs are not finite. An exception ends the episode.
         """
 
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:

@@ -523,7 +523,7 @@ CONFIG: Final = table_of(
     elsewhere={
         "seed": ", but an argument of reset",
         **dict.fromkeys(
-            ("render_mode", "backend", "hooks", "log_level"),
+            ("render_mode", "backend", "log_level"),
             ", but an argument of the environment's constructor",
         ),
     },

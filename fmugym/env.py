@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import logger as gymnasium_logger
 from gymnasium.envs.registration import EnvSpec
 
-from fmugym.checks import check_misplaced, check_option, check_seed
+from fmugym.checks import check_misplaced, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import (
     ConfigError,
@@ -49,11 +49,7 @@ __all__ = [
     "inner_env",
 ]
 
-_ARGUMENTS: Final = (
-    *("fmu_path", "config", "log_level", "render_mode", "backend", "isolation", "hooks"),
-)
-
-_WAYS: Final = ("auto", "compiled", "python")
+_ARGUMENTS: Final = (*("fmu_path", "config", "log_level", "render_mode", "backend", "isolation"),)
 
 _PLAYERS: Final = "fmugym.vector.one"
 """The module of players is imported late: it needs this one, and takes a while."""
@@ -91,9 +87,6 @@ class FMUEnv(Constructed):
             ``fmugym.pool.Paced`` around it. Or the name of a way to step the FMU, see
             ``fmugym.pool.wishes.Wishes``.
         isolation: Where the FMU runs; by default where the config says.
-        hooks: The way of calling hooks. ``"auto"`` compiles them at the first reset if that is
-            possible, so that the native pool runs them in its step; one may stay in Python.
-            ``"compiled"`` makes it an error if a hook cannot be compiled. ``"python"`` never does.
 
     Attributes:
         fmu: The FMU; ``fmu.description`` is its model description.
@@ -126,6 +119,14 @@ class FMUEnv(Constructed):
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own form)
 
+    vectorized: ClassVar[bool] = False
+    """Whether the hooks of this class body work on the arrays of N environments.
+
+    What a hook reads then has the environments on its last axis, and so has what it returns;
+    ``fmugym.testing.check_hooks`` finds out whether they do. A vector environment calls them once a
+    step, and other hooks once for each environment. A subclass that overrides hooks says it again.
+    """
+
     steps_after_end: ClassVar[bool] = False
     """Whether ``step`` may go on after the end of an episode, as some of Gymnasium's own do."""
 
@@ -144,15 +145,13 @@ class FMUEnv(Constructed):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
-        hooks: str = "auto",
         **unknown: Never,
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
-        self.inside.way = check_option("way of calling hooks", hooks, _WAYS)
         self._construct(FMUEnv, fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
-        if hooks != "python":
+        if self.inside.formulas is not None:
             import_module(_PLAYERS)  # so that the first reset does not wait for it
 
     # Gymnasium's interface.
@@ -196,8 +195,7 @@ class FMUEnv(Constructed):
         check_misplaced(misplaced)
         pool, inside = self._open_pool("reset"), self.inside
         if not inside.was_reset:
-            prepare_hooks(self)  # the constructor of the class may have set some as attributes
-            self._require_way(pool)
+            prepare_hooks(self)  # the constructor of the class may have changed the spaces
         seed, draws = check_seed(seed), draws_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
@@ -219,27 +217,13 @@ class FMUEnv(Constructed):
             self.render()
         return observation, info
 
-    def _obstacle(self, pool: Pool) -> str | None:
-        """What keeps the pool from calling hooks, whatever they compute."""
-        if self.inside.own.step or self.inside.own.reset:
-            return f"{'step' if self.inside.own.step else 'reset'} is overridden"
-        if not pool.plays_alone or pool.num_instances > 1:
-            return "the pool is not a native one of its own"
-        return None
-
-    def _require_way(self, pool: Pool) -> None:
-        obstacle = self._obstacle(pool)
-        if obstacle is not None and self.inside.way == "compiled":
-            name = type(self).__name__
-            raise ConfigError(f"the hooks of {name} cannot be compiled: {obstacle}")
-
     def _choose_player(self, pool: Pool) -> None:
-        """Compile the hooks, where that is possible and asked for."""
-        self.inside.has_chosen = True
-        if self.inside.way != "python" and self._obstacle(pool) is None:
-            self.inside.player = import_module(_PLAYERS).player_of(
-                self, self.inside.way == "compiled"
-            )
+        """Compile the expressions that the hooks are, where a native pool can run them."""
+        inside = self.inside
+        inside.has_chosen = True
+        is_plain = not (inside.own.step or inside.own.reset) and pool.num_instances == 1
+        if inside.formulas is not None and is_plain and pool.plays_alone:
+            inside.player = import_module(_PLAYERS).player_of(self)
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
@@ -261,7 +245,7 @@ class FMUEnv(Constructed):
         """
         player = self.inside.player
         if player is not None and self.render_mode is None:
-            result: Result | None = player.step(action, self)
+            result: Result | None = player.step(action)
             if result is not None:
                 return result
         return FMUEnv._step(self, action)
@@ -370,7 +354,6 @@ class FMUEnv(Constructed):
         columns = checked_snapshot(snapshot, length=1).columns_for(scope_of(self))
         if not self.inside.was_reset:
             prepare_hooks(self)  # as in ``reset``
-            self._require_way(pool)
         require_saving(pool)
         self.inside.keep()
         self.inside.ended = True  # there is no episode if the FMU fails

@@ -15,6 +15,7 @@ import fmu_tools
 import pytest
 import tiers
 import wine_tools
+from ways import in_python, many
 
 import fmugym
 from fmugym.errors import ConfigError
@@ -123,14 +124,22 @@ def opened():
 
 @pytest.fixture
 def load(opened):
-    """Make environments of declared tasks that are closed after the test."""
-    return lambda *arguments, **options: opened(fmugym.load(*arguments, **options))
+    """Make environments of declared tasks that are closed after the test.
+
+    Their expressions are evaluated in the way ``"Python"``, or by programs.
+    """
+
+    def make(*arguments, way=None, **options):
+        env = opened(fmugym.load(*arguments, **options))
+        return in_python(env) if way == "Python" else env
+
+    return make
 
 
 @pytest.fixture
 def make_envs(opened):
-    """Make vector environments that are closed after the test."""
-    return lambda *arguments, **options: opened(fmugym.FMUVectorEnv(*arguments, **options))
+    """Make vector environments that are closed after the test, and call hooks in a ``way``."""
+    return lambda *arguments, **options: opened(many(*arguments, **options))
 
 
 @pytest.fixture

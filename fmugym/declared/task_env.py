@@ -17,7 +17,7 @@ __all__ = ["TaskEnv"]
 
 
 _ARGUMENTS: Final = (
-    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "master", "scenario"),
+    *("config", "log_level", "render_mode", "backend", "isolation", "master", "scenario"),
 )
 
 
@@ -33,7 +33,6 @@ class TaskEnv(FMUEnv):
         render_mode: As for ``FMUEnv``.
         backend: As for ``FMUEnv``.
         isolation: As for ``FMUEnv``.
-        hooks: As for ``FMUEnv``.
         master: Of a system: ``"gauss_seidel"`` or ``"jacobi"``, in the place of what its SSP
             archive or the task says.
 
@@ -58,7 +57,6 @@ class TaskEnv(FMUEnv):
         render_mode: str | None = None,
         backend: Any = None,
         isolation: str | None = None,
-        hooks: str = "auto",
         master: str | None = None,
         **unknown: Never,
     ) -> None:
@@ -94,7 +92,6 @@ class TaskEnv(FMUEnv):
                 render_mode=render_mode,
                 backend=backend,
                 isolation=isolation,
-                hooks=hooks,
             )
 
     @property

@@ -112,7 +112,7 @@ class CartPoleEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        self.sutton_barto_reward = check_flag("sutton_barto_reward", sutton_barto_reward)
+        is_sutton_barto = check_flag("sutton_barto_reward", sutton_barto_reward)
         given = {} if model_parameters is None else model_parameters
         parameters, numbers = with_task_numbers(_NUMBERS, given)
         start = {name: Uniform(-0.05, 0.05) for name in START_VALUES}
@@ -124,7 +124,7 @@ class CartPoleEnv(FMUEnv):
             "time_step": 0.02,
             "inputs": {"f": "force_mag * (2 * action - 1)"},
             "terminated": "abs(x) > x_threshold or abs(phi) > theta_threshold_radians",
-            "reward": "0 - done" if sutton_barto_reward else "1 - (done and after_end)",
+            "reward": "0 - done" if is_sutton_barto else "1 - (done and after_end)",
         }
         fmu_path = bundled_fmu("CartPole", fmi_version)
         super().__init__(fmu_path, config, log_level, render_mode=render_mode, **options)

@@ -38,7 +38,7 @@ def environment(task: Task, **arguments: Any) -> TaskEnv:
     Raises:
         ConfigError: If its class is no ``TaskEnv``, whose variables have names.
     """
-    env = load(task, hooks="python", **arguments)
+    env = load(task, **arguments)
     if isinstance(env, TaskEnv):
         return env
     env.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from inspect import getattr_static
@@ -30,7 +30,7 @@ from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.class_formulas import class_formulas, with_monitors
 from fmugym.task.episode import EpisodeDraws
-from fmugym.task.hooks import Hooks, misspelt_hooks
+from fmugym.task.hooks import AssignedHook, Hooks, misspelt_hooks
 from fmugym.task.input_writer import InputWriter
 from fmugym.task.inside import Inside, OwnHooks, is_overridden
 from fmugym.task.interface import resolve
@@ -39,6 +39,7 @@ from fmugym.task.plain import plain_attributes
 from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
+from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
@@ -239,8 +240,13 @@ def require_construction(env: Constructed) -> None:
 
 
 def prepare_hooks(env: Constructed) -> None:
-    """Find out which hooks an environment overrides, and prepare the defaults of the others."""
+    """Find out which hooks an environment overrides, and prepare the defaults of the others.
+
+    Raises:
+        ConfigError: If a hook of a step is an attribute of the environment.
+    """
     inside, space, base = env.inside, env.observation_space, env.inside.base
+    _require_methods(env)
     if env.config.draws_start_time and env.config.stop_time is not None:
         _let_stop_time_end_episodes(env)
     inside.own = own = OwnHooks.of(env, base, inside.expressed)
@@ -262,14 +268,28 @@ def prepare_hooks(env: Constructed) -> None:
     inside.as_constructed = plain_attributes(vars(env), inside.own_names)
 
 
+def _require_methods(env: Constructed) -> None:
+    for name in (*ORDER, "_goal_reward"):
+        if not isinstance(vars(env).get(name), AssignedHook | None):
+            raise ConfigError(
+                f"{name} was assigned to an environment of {type(env).__name__}; write this hook "
+                "as a method of the class"
+            )
+
+
 def _let_stop_time_end_episodes(env: Constructed) -> None:
     """Each episode has its own last step, as each has its own start time."""
-    hook = env._is_truncated
-    is_expressed = "_is_truncated" in env.inside.expressed and not is_overridden(
-        env, env.inside.base, "_is_truncated"
-    )
-    if not is_expressed and not isinstance(hook, _StopTime):
-        vars(env)["_is_truncated"] = _StopTime(env, hook)
+    inside, name = env.inside, "_is_truncated"
+    hook, stop_time = env._is_truncated, env.config.stop_time or 0.0
+    is_expressed = name in inside.expressed and not is_overridden(env, inside.base, name)
+    if is_expressed or isinstance(hook, AssignedHook):
+        return
+
+    def is_truncated() -> Any:
+        rest: Any = stop_time - env.time
+        return hook() | (rest < inside.spec.time_step * (1 - 1e-9))
+
+    env._is_truncated = AssignedHook(is_truncated)  # type: ignore[method-assign]
 
 
 def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodeDraws:
@@ -289,7 +309,7 @@ def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> Episo
     return EpisodeDraws(
         tuple((interface.parameter_variables | given_variables).values()),
         {**interface.parameters, **own},
-        env.config.variable_starts,
+        env.config.variable_starts | env.inside.variable_starts,
         own.keys(),
     )
 
@@ -371,23 +391,6 @@ def _step_limit(config: EnvConfig, spec: PoolSpec, warm_up_steps: int) -> int:
             f"after start_time = {start} s and the warm-up"
         )
     return limit if drawn else min(limit, steps)
-
-
-class _StopTime:
-    """The hook that truncates an episode if another step would pass the stop time.
-
-    Args:
-        env: The environment, whose episodes begin at different times.
-        own: Its hook that truncates episodes for other reasons.
-    """
-
-    def __init__(self, env: Constructed, own: Callable[[], Any]) -> None:
-        self._env, self._own = env, own
-
-    def __call__(self) -> Any:
-        env: Any = self._env
-        is_over = env.config.stop_time - env.time < env.inside.spec.time_step * (1 - 1e-9)
-        return self._own() | is_over
 
 
 def _until_stop_time(formulas: Formulas, config: EnvConfig, spec: PoolSpec) -> Formulas:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from difflib import get_close_matches
 from inspect import signature
@@ -24,7 +24,7 @@ from fmugym.task.values import NamedValues
 if TYPE_CHECKING:
     from fmugym.rendering import Scene
 
-__all__ = ["Hooks", "misspelt_hooks"]
+__all__ = ["AssignedHook", "Hooks", "misspelt_hooks"]
 
 _ALIKE: Final = 0.85
 """How alike the names of a method and of a hook are if one is meant to be the other."""
@@ -61,6 +61,21 @@ def _with_copied_goals(observation: Any) -> Any:
         return observation
     names = [name for name in ("achieved_goal", "desired_goal") if name in observation]
     return observation | {name: copy(observation[name]) for name in names}
+
+
+class AssignedHook:
+    """A hook of one environment, whatever its class: what the package assigns to the environment.
+
+    Args:
+        call: Does what the hook does.
+    """
+
+    def __init__(self, call: Callable[[], Any]) -> None:
+        self._call = call
+
+    def __call__(self) -> Any:
+        """Do what the hook does."""
+        return self._call()
 
 
 class Hooks(gymnasium.Env[Any, Any]):

@@ -83,7 +83,6 @@ class Inside:
     Attributes:
         number: Tells which environments are newer.
         base: ``FMUEnv``, with whose methods those of an environment are compared.
-        way: The way of calling hooks, see ``FMUEnv``.
         own_names: The attributes that are not a subclass's own.
         as_constructed: The plain attributes of a subclass when its hooks were prepared.
         interface: The variables of the config, as the FMU has them.
@@ -122,6 +121,8 @@ class Inside:
         elements: The integers that are actions; None for other spaces.
         action_values: The values of the input for these, if they are others.
         step_limit: The number of steps after which an episode is truncated.
+        variable_starts: By name, what episode variables start with in the place of what the config
+            says.
         warm_ups: What happens in warm-ups with moving inputs, or None.
         warm_up_steps: The steps of a warm-up.
         has_info: Whether a step has an info.
@@ -180,19 +181,19 @@ class Inside:
     start_inputs: list[tuple[str, float]]
     step_limit: int
     step_pool: Callable[[], int]
+    variable_starts: dict[str, Any]
     warm_up_steps: int
     warm_ups: WarmUps | None
     was_reset: bool
-    way: str
 
     def __init__(self, number: int) -> None:
-        self.number, self.own_names, self.way = number, frozenset(), "auto"
+        self.number, self.own_names = number, frozenset()
         self.pool_tells = self.has_info = self.has_chosen = False
         self.in_hooks = self.was_reset = self.is_closed = False
         self.standing_in = RLock()
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
-        self.formulas, self.expressed = None, {}
+        self.formulas, self.expressed, self.variable_starts = None, {}, {}
         self.future = self.controllers = self.signal_of = self.model = None
         self.held = lambda: ()
         self.pictured = None, 0.0

@@ -218,6 +218,8 @@ def _content(column: Any) -> Any:
         return {name: _content(part) for name, part in column.items()}
     if isinstance(column, np.ndarray) and column.dtype == object:
         column = column.tolist()
+    if isinstance(column, list) and any(isinstance(one, dict) for one in column):
+        return [_content(one) for one in column]
     try:
         array = np.asarray(column)
     except ValueError:  # arrays of different shapes

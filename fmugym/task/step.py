@@ -1,12 +1,12 @@
 """The order of a step: what is asked of the hooks when the FMU has stepped.
 
-Single environments, batches of environments and traces of hooks differ in what hooks read and
-return: numbers, arrays or symbols. They share this order.
+Single environments and batches of environments differ in what hooks read and return: numbers or
+arrays. They share this order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from fmugym.task.results import as_flag, as_reward
@@ -14,7 +14,7 @@ from fmugym.task.results import as_flag, as_reward
 if TYPE_CHECKING:
     from fmugym.task.hooks import Hooks
 
-__all__ = ["NUMBERS", "ORDER", "Form", "Numbers", "conclude", "conclude_left"]
+__all__ = ["NUMBERS", "ORDER", "Form", "Numbers", "conclude"]
 
 ORDER: Final = (
     "_get_inputs",
@@ -29,7 +29,7 @@ ORDER: Final = (
 
 
 class Form(Protocol):
-    """Turns what hooks return into numbers, arrays or symbols.
+    """Turns what hooks return into numbers or arrays.
 
     Each method raises ``ConfigError`` with the name of the hook if a result cannot be used.
 
@@ -101,34 +101,3 @@ def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) 
     if type(reward) is not form.reward_type:
         reward = form.rewards(reward)
     return observed, reward, done, cut_off
-
-
-def conclude_left(
-    env: Hooks, form: Form, left: Container[str], concluded: tuple[Any, ...]
-) -> tuple[Any, ...]:
-    """Ask those hooks for their part of the result of a step that are not compiled.
-
-    Args:
-        env: The environment; its attributes hold what hooks read after the step.
-        form: What the results become.
-        left: The hooks.
-        concluded: The observation, the reward, terminated and truncated as the programs leave them.
-
-    Returns:
-        The same with what the hooks add; the observation is as the hook returned it.
-    """
-    observation, reward, done, cut_off = concluded
-    if "_update" in left:
-        form.update(env)
-    if "_is_done" in left:
-        done = form.flags("_is_done", env._is_done()) | done
-        env.inside.readings.done = done
-    if "_is_truncated" in left:
-        cut_off = form.flags("_is_truncated", env._is_truncated()) | cut_off
-    if "_reward_policy" in left and "_get_observation" in left:
-        reward, observation = env._reward_and_observation()
-    elif "_reward_policy" in left:
-        reward = env._reward_policy()
-    elif "_get_observation" in left:
-        observation = env._get_observation()
-    return observation, form.rewards(reward), done, cut_off

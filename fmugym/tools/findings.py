@@ -59,7 +59,8 @@ class Report:
         findings: The results in the order of the checks.
         costs: Seconds of real time by name: ``step``, ``reset`` and ``restore`` of one environment.
             None for a restore that the FMU does not allow.
-        hooks: How a vector environment calls the hooks: ``compiled``, ``array`` or ``per_env``.
+        hooks: How a vector environment calls the hooks: ``expressions``, ``arrays`` or
+            ``one by one``.
         reset_method: How episodes begin.
         recommended: Settings that suit the task, by name.
         advices: Lines for the task file, of these settings.

@@ -22,7 +22,6 @@ from fmugym.vector.action_arrays import array_of
 
 __all__ = [
     "ARGUMENTS",
-    "HOOKS",
     "POOL_OPTIONS",
     "UnknownAttributeError",
     "autoreset_mode_of",
@@ -32,13 +31,10 @@ __all__ = [
     "split_options",
 ]
 
-HOOKS: Final = ("auto", "compiled", "array", "per_env")
-"""The ways of calling hooks."""
-
 POOL_OPTIONS: Final = ("threads", "private_libraries", "isolation", "workers", "call_timeout")
 """The arguments that are meant for the pool."""
 
-ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode", "hooks")
+ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode")
 """The arguments that are not."""
 
 _LEAST_BYTES_PER_ENV: Final = 1024

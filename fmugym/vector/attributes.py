@@ -10,12 +10,14 @@ import numpy as np
 from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.pool.base import FloatArray
 from fmugym.task.construction import draws_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.calls import TOGETHER, require_settable
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
+from fmugym.vector.views import take
 
 __all__ = ["Attributes"]
 
@@ -81,6 +83,21 @@ class Attributes:
         else:
             self.set_attribute(name, dict(enumerate(each)))
 
+    def _numbers(self, name: str, each: Sequence[Any]) -> FloatArray:
+        """The values of an episode variable, environments last.
+
+        Raises:
+            ConfigError: If they have another shape, or are no finite numbers.
+        """
+        shape = np.shape(take(self._prototype.variables[name], 0))
+        try:
+            values = np.array([np.broadcast_to(np.asarray(v, np.float64), shape) for v in each])
+        except Exception:  # the values are the caller's
+            values = np.array(np.nan)
+        if not np.isfinite(values).all():
+            raise ConfigError(f"{name!r} takes numbers of shape {shape}, got {shown(each)}")
+        return np.moveaxis(values, 0, -1)
+
     def _each(self, name: str, values: Any) -> list[Any]:
         """The values of all environments in their order."""
         count = len(self._engine.ended)
@@ -116,19 +133,30 @@ class Attributes:
             self._engine.set_parameter(variable.name, column)
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
-        """Set an attribute of some environments.
+        """Set an attribute, or an episode variable, of some environments.
 
         Args:
-            name: One that hooks read.
+            name: An attribute that hooks read, or a variable; expressions read no attributes.
             values: By the number of the environment.
 
         Raises:
             ConfigError: If there is no such attribute, or every environment keeps it itself.
         """
-        env = self._prototype
+        env, names = self._prototype, [*self._prototype.fmu.description.variables]
+        if name in env.variables:
+            drawn = name in env.inside.draws.drawn_names
+            if drawn and len(values) < len(self._engine.ended):
+                raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
+            present = [take(env.variables[name], i) for i in range(len(self._engine.ended))]
+            each = [values.get(index, one) for index, one in enumerate(present)]
+            self._engine.set_variable(name, self._numbers(name, each))
+            return
+        names += env.variables
+        if self._engine.has_expressions_only:
+            what = "parameter or episode variable, which is all that expressions read,"
+            raise UnknownAttributeError(str(unknown_name(what, name, names)))
         if not hasattr(env, name):  # no hook can know of it: the name is misspelt
-            public = [known for known in dir(env) if not known.startswith("_")]
-            names = public + list(env.fmu.description.variables)
+            names += [known for known in dir(env) if not known.startswith("_")]
             raise UnknownAttributeError(str(unknown_name("attribute or parameter", name, names)))
         require_settable(name)
         self._engine.set_attribute(name, values)

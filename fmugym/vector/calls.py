@@ -6,14 +6,13 @@ taken over by the batch.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.contents import Contents
 
 __all__ = ["TOGETHER", "MethodCalls", "attribute", "require_settable"]
 
@@ -39,13 +38,15 @@ def require_settable(name: str) -> None:
 
 
 def attribute(env: FMUEnv, name: str) -> Any:
-    """Return an attribute of an environment, or else a parameter of its episode.
+    """Return an attribute of an environment, or else a variable or parameter of its episode.
 
     Raises:
         ConfigError: If there is none of this name (it is an ``AttributeError``, too).
     """
-    if not hasattr(env, name) and name in env.parameters:
-        return env.parameters[name]
+    if not hasattr(env, name):
+        for own in (env.variables, env.parameters):
+            if name in own:
+                return own[name]
     try:
         return getattr(env, name)
     except AttributeError as error:
@@ -75,19 +76,17 @@ class MethodCalls:
         """Call the method, or return the attribute if it is none.
 
         Args:
-            env: The prototype, which reads the values of this environment. Afterwards it is as
-                before, also in the objects that it holds.
+            env: The prototype, which reads the values of this environment. Afterwards it has its
+                attributes of before.
             index: The number of this environment.
             name: The name of the method.
             arguments: The arguments of the method by position.
             keywords: Those by name.
 
         Raises:
-            ConfigError: If the method assigns what the environment keeps itself, or changes an
-                attribute in place.
+            ConfigError: If the method assigns what the environment keeps itself.
         """
-        contents, before = Contents(env), dict(vars(env))
-        readings, variables = Readings.of(env), dict(env.variables)
+        before, readings, variables = dict(vars(env)), Readings.of(env), dict(env.variables)
         try:
             value = attribute(env, name)
             returned = value(*arguments, **keywords) if callable(value) else value
@@ -95,27 +94,14 @@ class MethodCalls:
             for reading in READINGS:
                 if getattr(readings, reading) is not getattr(now, reading):
                     require_settable(reading)
-            self._note_attributes(index, before, vars(env), contents.changed_in_place())
+            for own, value in vars(env).items():
+                if own not in before or value is not before[own]:
+                    require_settable(own)
+                    self.attributes.setdefault(own, {})[index] = value
             for variable, number in env.variables.items():
                 if variables[variable] is not number:
                     self.variables.setdefault(variable, {})[index] = number
         finally:
-            contents.restore()
+            vars(env).clear()
+            vars(env).update(before)
         return returned
-
-    def _note_attributes(
-        self,
-        index: int,
-        before: Mapping[str, Any],
-        after: Mapping[str, Any],
-        in_place: Collection[str],
-    ) -> None:
-        for name, value in after.items():
-            if name not in before or value is not before[name]:
-                require_settable(name)
-                self.attributes.setdefault(name, {})[index] = value
-            elif name in in_place:
-                raise ConfigError(
-                    f"a method changes self.{name} in place, which all environments share: let it "
-                    "assign a number instead, or make the vector environment with hooks='per_env'"
-                )

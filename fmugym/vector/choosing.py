@@ -1,55 +1,144 @@
-"""Chooses how the hooks of N environments are called: the engine of a vector environment."""
+"""How the hooks of N environments are called: in programs, on arrays, or one by one."""
 
 from __future__ import annotations
 
 import logging
+from typing import Any, Final
 
+from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, warn_once
+from fmugym.expressions.program import UntraceableError
 from fmugym.pool import Pool
-from fmugym.pool.extension import require_engine
+from fmugym.pool.extension import has_native_pool
+from fmugym.task.hooks import Hooks
+from fmugym.task.step import ORDER
+from fmugym.vector.action_arrays import is_array_space
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.engines.per_env import PerEnvEngine
-from fmugym.vector.engines.programs import find_programs
-from fmugym.vector.hooks.check import CURE, find_difference
-from fmugym.vector.hooks.formula_programs import formulas_of
+from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.making import EnvMaker
 
-__all__ = ["make_engine"]
+__all__ = ["hook_of_one", "make_engine", "no_arrays", "require_own_order"]
 
 logger = logging.getLogger(__name__)
 
+_MANY: Final = 16
+"""From so many environments on, calling hooks one by one is worth a warning."""
+
+_KEYS: Final = {
+    "_get_inputs": "inputs",
+    "_update": "memory",
+    "_is_done": "terminated",
+    "_is_truncated": "truncated",
+    "_reward_policy": "reward",
+    "_get_observation": "observations",
+    "_get_info": "info",
+}
+"""The keys of the config whose expressions stand for hooks."""
+
 
 def make_engine(
-    maker: EnvMaker, prototype: FMUEnv, pool: Pool, hooks: str, max_episode_steps: int | None
+    maker: EnvMaker, prototype: FMUEnv, pool: Pool, max_episode_steps: int | None
 ) -> Engine:
-    """Make the fastest engine that gives correct results, or the one that is asked for.
+    """Make the engine of N environments.
+
+    Expressions run as programs. Hooks that are vectorized are called once a step, on arrays; all
+    others once for each environment, with a warning if there are many of these.
 
     Args:
-        maker: Makes the other environments if hooks are called one environment at a time.
+        maker: Makes the other environments if hooks are called one by one.
         prototype: The environment that was made already; it uses the pool.
         pool: The FMUs of all environments.
-        hooks: The way of calling hooks, see ``FMUVectorEnv``.
         max_episode_steps: Truncates episodes.
+    """
+    reason = _reason(prototype)
+    if reason is None:
+        task = _programs(prototype) or TaskPrograms.without_programs(prototype.variables)
+        return BatchEngine(prototype, pool.num_instances, max_episode_steps, task)
+    if pool.num_instances >= _MANY:
+        warn_once(logger, f"the hooks of {type(prototype).__name__} are called {reason}")
+    envs = _make_all(maker, prototype, pool.num_instances)
+    space = batch_space(prototype.action_space, len(envs))
+    return PerEnvEngine(envs, pool, max_episode_steps, space)
+
+
+def require_own_order(env: FMUEnv) -> None:
+    """Refuse a class that does what only a single environment can do.
 
     Raises:
-        ConfigError: If the hooks cannot be called as asked for.
+        ConfigError: If it overrides ``step`` or ``reset``.
     """
-    count = pool.num_instances
-    if not _use_arrays(prototype, hooks):
-        envs = _make_all(maker, prototype, count)
-        return PerEnvEngine(
-            envs, pool, max_episode_steps, batch_space(prototype.action_space, count)
+    own, name = env.inside.own, type(env).__name__
+    if own.step or own.reset:
+        method = "step" if own.step else "reset"
+        raise ConfigError(
+            f"{name} overrides {method}, which a FMUVectorEnv does not call; make a "
+            f"gymnasium.vector.SyncVectorEnv([{name}] * N) instead"
         )
-    if hooks == "array":
-        task = TaskPrograms.without_programs(prototype)
-    else:
-        task = find_programs(prototype, required=hooks == "compiled")
-    return BatchEngine(prototype, count, max_episode_steps, task)
+
+
+def _programs(env: FMUEnv) -> TaskPrograms | None:
+    """The programs of an environment whose hooks are expressions."""
+    formulas = formulas_of(env)
+    if formulas is None:
+        return None
+    try:
+        return compile_formulas(env, formulas)
+    except UntraceableError as reason:
+        text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
+        logger.info("%s. They are evaluated on arrays, which is slower", text)
+        return None
+
+
+def _reason(env: FMUEnv) -> str | None:
+    """Why hooks are called one by one; None if they are not."""
+    obstacle = no_arrays(env)
+    if obstacle is not None:
+        return f"one environment at a time, because {obstacle}"
+    hook = None if formulas_of(env) else hook_of_one(type(env))
+    if hook is not None:
+        key = f"; or give an expression under {_KEYS[hook]!r}" if hook in _KEYS else ""
+        return (
+            f"one environment at a time, which is slow, because {hook} is not vectorized: let "
+            f"fmugym.testing.check_hooks find out whether they work on arrays, and write "
+            f"vectorized = True in the class that has {hook}{key}"
+        )
+    if not has_native_pool():
+        return "one environment at a time, because there is no C extension"
+    return None
+
+
+def hook_of_one(cls: type[FMUEnv]) -> str | None:
+    """The first hook of a step that works on the numbers of one environment, as classes say.
+
+    A default works on arrays. Any other hook does if the class body that has it says so.
+    """
+    for name in (*ORDER, "_goal_reward"):
+        owner = next(one for one in cls.__mro__ if name in vars(one))
+        if owner is not Hooks and not vars(owner).get("vectorized", False):
+            return name
+    return None
+
+
+def no_arrays(env: FMUEnv) -> str | None:
+    """What of N environments makes no arrays, in words; None if everything does."""
+    if not is_array_space(env.action_space):
+        return f"actions of {env.action_space} do not make one array"
+    if not _makes_arrays(env.observation_space):
+        return f"observations of {env.observation_space} do not make arrays"
+    return None
+
+
+def _makes_arrays(space: spaces.Space[Any]) -> bool:
+    """Whether observations of N environments are an array, or a dict of arrays."""
+    if isinstance(space, spaces.Dict):
+        return all(map(_makes_arrays, space.values()))
+    return is_array_space(space)
 
 
 def _make_all(maker: EnvMaker, prototype: FMUEnv, count: int) -> list[FMUEnv]:
@@ -62,18 +151,3 @@ def _make_all(maker: EnvMaker, prototype: FMUEnv, count: int) -> list[FMUEnv]:
             env.close()
         raise
     return envs
-
-
-def _use_arrays(prototype: FMUEnv, hooks: str) -> bool:
-    if hooks == "per_env":
-        return False
-    require_engine(f"a vector environment with hooks={hooks!r} instead of 'per_env'")
-    difference = None if formulas_of(prototype) else find_difference(prototype)
-    if difference is None:
-        return True
-    name = type(prototype).__name__
-    text = f"{name}: {difference}, so its hooks cannot be called on arrays. {CURE}"
-    if hooks != "auto":
-        raise ConfigError(text)
-    logger.warning("%s. Until then they are called one environment at a time: slower", text)
-    return False

@@ -41,7 +41,6 @@ def _make(
     num_envs: int = 1,
     max_episode_steps: int | None = None,
     autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-    hooks: str = "auto",
     backend: Any = "auto",
     **kwargs: Any,
 ) -> FMUVectorEnv:
@@ -58,7 +57,6 @@ def _make(
             num_envs,
             max_episode_steps=max_episode_steps,
             autoreset_mode=autoreset_mode,
-            hooks=hooks,
             backend=backend,
             **pool_options,
         )

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-import sys
 import weakref
-from collections.abc import Callable, Iterator, Mapping
-from copy import deepcopy
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -18,44 +16,36 @@ from fmugym.expressions.program import UntraceableError
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, judged
 from fmugym.task.native_draws import no_draws
-from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.step import ORDER
-from fmugym.vector.contents import borrowed, differs
+from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.programs import attempt, compile_hooks
-from fmugym.vector.hooks.check import find_difference, sample_states, states_around
-from fmugym.vector.hooks.formula_programs import formulas_of
+from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.memory import Memory
-from fmugym.vector.hooks.patches import exclusive
-from fmugym.vector.hooks.purity import names_in_hooks, require_pure
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.views import batched, column
+from fmugym.vector.views import batched
 
 __all__ = ["Player", "player_of"]
 
 logger = logging.getLogger(__name__)
 
-_REACHES: Final = ((0.01, 0.1, 0.3), (0.5, 1.0, 3.0))
-"""How far the states are from the present one in which programs and hooks are compared. In those
-that are far, hooks may fail; both batches are of the same size."""
 
-_NUMBERS: Final = (bool, int, float, np.bool_, np.integer, np.floating)
-
-
-def player_of(env: FMUEnv, required: bool) -> Player | None:
-    """Compile the hooks of an environment in an episode.
+def player_of(env: FMUEnv) -> Player | None:
+    """Compile the expressions of an environment in an episode.
 
     Args:
         env: The environment, with a native pool of its own.
-        required: Whether hooks that cannot be compiled are an error.
 
     Returns:
-        None if they cannot.
-
-    Raises:
-        ConfigError: If they cannot, but must.
+        None if they cannot be compiled, or if there is another hook.
     """
-    return attempt(env, lambda: Player(env), required, "in Python")
+    formulas = formulas_of(env)
+    if formulas is None:
+        return None
+    try:
+        return Player(env, compile_formulas(env, formulas))
+    except UntraceableError as reason:
+        text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
+        logger.info("%s. They are evaluated in Python, which is slower", text)
+        return None
 
 
 class Player:
@@ -63,45 +53,35 @@ class Player:
 
     Between two steps, the environment reads from the pool's arrays. As soon as Python has to do a
     step, to write what hooks read, or to start an episode, it reads from an object of its own
-    again. The programs hold the values that attributes had when they were made. A number that is
-    assigned later becomes an array of one, as ``set_attr`` of a vector environment makes it.
+    again.
 
     Args:
         env: The environment, in an episode.
+        task: The programs of its expressions.
 
     Attributes:
         readings: What hooks read from the pool's arrays.
-        step: Does a step by an action and the environment; see
-            ``_native.Pool.step_one``.
-
-    Raises:
-        UntraceableError: If one of the hooks cannot be compiled.
+        step: Does a step by an action; see ``_native.Pool.step_one``.
     """
 
-    step: Callable[[Any, FMUEnv], Any]
+    step: Callable[[Any], Any]
 
-    def __init__(self, env: FMUEnv) -> None:
+    def __init__(self, env: FMUEnv, task: TaskPrograms) -> None:
         env.inside.keep()
-        self._env = weakref.ref(env)
         self._own = env.inside.own_readings
-        self._pool: Any = env.inside.pool
-        self._numbers: dict[str, npt.NDArray[Any]] = {}
-        self._compile(env)
-
-    def _compile(self, env: FMUEnv) -> None:
-        self._watched = tuple(_watched_in(env))
-        task = _traced(env, self._numbers)
+        pool: Any = env.inside.pool
+        self._pool = env.inside.pool
         draws, ended = env.inside.draws, np.ones(1, np.bool_)
         self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
         starts = draws.constants[:, None].copy()
-        self._memory = memory = Memory(env, self._rows, ended, self._numbers)
+        self._memory = memory = Memory(env, self._rows, ended)
         memory.parameters = dict(zip(draws.parameter_names, starts, strict=True))
         memory.hold(task)
         self._task = task
         reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
         self._parameters = memory.parameters if reads else {}
         shapes, form, divided = Layout(task, env, 1).of_one()
-        self._complete = None if divided is None else partial(_complete, divided)
+        complete = None if divided is None else partial(_complete, divided)
         memory.prepare(
             self._pool,
             task,
@@ -111,14 +91,8 @@ class Player:
             (tuple, form, (), shapes, (None,) * 3),
         )
         self.readings: Any = PoolReadings(env, self._own, self._rows)
-        self._watch()
-
-    def _watch(self) -> None:
-        """Let the pool compare the attributes before each step."""
-        self._may_change = [one for one in self._watched if one.copy is not None]
-        watched = tuple(part for one in self._watched for part in one[:2])
-        judge = partial(_judge_again, self._env)
-        self.step = partial(self._pool.step_one, judge, self._complete, watched)
+        judge = partial(_judge_again, weakref.ref(env))
+        self.step = partial(pool.step_one, judge, complete)
 
     def play(self, env: FMUEnv, action: Any) -> Result | None:
         """Let the pool do the whole step.
@@ -126,12 +100,10 @@ class Player:
         Returns:
             None if Python must do it.
         """
-        result = None
         if env.inside.readings is self.readings or self._take_over(env):
-            result = self.step(action, env)
-        if result is None and self._renew(env) and self._take_over(env):
-            result = self.step(action, env)
-        return result
+            result: Result | None = self.step(action)
+            return result
+        return None
 
     # From Python to the pool and back.
 
@@ -142,8 +114,6 @@ class Player:
             False if there is no episode, or if the environment keeps what programs cannot hold.
         """
         if env.inside.ended:
-            return False
-        if any(map(Watched.has_changed, self._may_change)) and not self._renew(env):
             return False
         own, memory = self._own, self._memory
         none = env.inside.no_action
@@ -192,42 +162,6 @@ class Player:
         own.done = inside.ended = False
         for name in self._task.updated:
             own.variables[name] = _number_of(memory.before[name][..., 0])
-
-    def _renew(self, env: FMUEnv) -> bool:
-        """Take over attributes that were assigned or changed.
-
-        Returns:
-            Whether there were any, and compiled steps may go on.
-        """
-        changed = [one for one in self._watched if one.differs_in(env) or one.has_changed()]
-        if not changed:
-            return False
-        self.keep(env.inside)
-        try:
-            taken = [self._takes(one.name, vars(env).get(one.name)) for one in changed]
-            if all(taken):
-                self._watched = tuple(_watched_in(env))
-                self._watch()
-            else:
-                self._compile(env)
-        except Exception as reason:  # as in ``player_of``
-            env.inside.player = None
-            text = f"the hooks of {type(env).__name__} cannot be compiled any more: {reason}"
-            logger.info("%s. They run in Python, which is slower", text)
-            return False
-        return True
-
-    def _takes(self, name: str, value: Any) -> bool:
-        """Whether a number goes to an array that the programs read already; otherwise make one."""
-        array = self._numbers.pop(name, None)
-        if not isinstance(value, _NUMBERS):
-            return False
-        self._numbers[name] = row = np.array([value]) if array is None else array
-        if array is None or np.asarray(value).dtype != row.dtype:
-            self._numbers[name] = np.array([value])
-            return False
-        row[0] = value
-        return True
 
 
 def _judge_again(ref: weakref.ref[FMUEnv]) -> Result:
@@ -286,85 +220,6 @@ _FROM_POOL: Final[Mapping[str, Callable[[npt.NDArray[Any]], Any]]] = {
 
 for _name, _make in _FROM_POOL.items():
     setattr(PoolReadings, _name, _read_from_pool(_name, _make))
-
-
-class Watched(NamedTuple):
-    """An attribute that programs depend on.
-
-    Attributes:
-        name: Its name.
-        value: The object that it is; an ellipsis for an attribute of the class only.
-        copy: What a list, dict or array held.
-    """
-
-    name: str
-    value: Any
-    copy: Any
-
-    def differs_in(self, env: FMUEnv) -> bool:
-        """Whether the attribute of an environment is another object."""
-        return vars(env).get(self.name, ...) is not self.value
-
-    def has_changed(self) -> bool:
-        """Whether the object has changed in place."""
-        return self.copy is not None and differs(self.copy, self.value)
-
-
-def _watched_in(env: FMUEnv) -> Iterator[Watched]:
-    """The attributes to which hooks refer by name, and the hooks themselves."""
-    attributes, names = vars(env), set() if formulas_of(env) else names_in_hooks(env)
-    if "getattr" in names:
-        names |= attributes.keys()
-    for name in sorted((names - env.inside.own_names) | set(ORDER)):
-        value = attributes.get(name, ...)
-        if value is not ... or hasattr(type(env), name):
-            can_change = isinstance(value, (list, dict, set, tuple, np.ndarray))
-            yield Watched(name, value, deepcopy(value) if can_change else None)
-
-
-def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TaskPrograms:
-    """Compile the hooks, and compare the programs with them on states around the present one.
-
-    Formulas need no comparison.
-    """
-    if formulas_of(env):
-        return compile_hooks(env, [])
-    if _is_debugged():
-        raise UntraceableError("a debugger is attached")
-    require_pure(env)
-    near, far = (sample_states(env, (1.0,), states_around(env, r)) for r in _REACHES)
-    with borrowed(env, outside=True) as contents:
-        _call_hooks(env, column(near, 0))
-        changes = contents.changes()
-    changed = changes.outside or changes.added
-    if changed is not None:
-        raise UntraceableError(f"it changes {changed} outside of self")
-    count = len(near.step_count)
-    with exclusive, borrowed(env):  # in this order, as tracing does
-        vars(env).update({name: np.repeat(number, count) for name, number in numbers.items()})
-        task = compile_hooks(env, [near, far], numbers)
-    if task.left:
-        raise UntraceableError("; ".join(task.left.values()))
-    difference = find_difference(env, near)
-    if difference is not None:
-        raise UntraceableError(difference)
-    return task
-
-
-def _call_hooks(env: FMUEnv, readings: Readings) -> None:
-    """Call each hook once, whatever it returns or raises."""
-    with reading(env, readings), np.errstate(all="ignore"):
-        for name in ORDER:
-            try:
-                getattr(env, name)()
-            except Exception:  # hooks may raise anything
-                continue
-
-
-def _is_debugged() -> bool:
-    """Whether something follows each line, except for what measures the coverage of tests."""
-    follower = sys.gettrace()
-    return follower is not None and not type(follower).__module__.startswith("coverage")
 
 
 def _exactly(value: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.checks import check_count, check_misplaced, check_option
+from fmugym.checks import check_count, check_misplaced
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.task.construction import prepare_hooks, require_construction
@@ -21,7 +21,6 @@ from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.specs import EpisodeLimit
 from fmugym.vector.arguments import (
-    HOOKS,
     autoreset_mode_of,
     checked_num_envs,
     checked_pool_options,
@@ -29,7 +28,7 @@ from fmugym.vector.arguments import (
     split_options,
 )
 from fmugym.vector.attributes import Attributes
-from fmugym.vector.choosing import make_engine
+from fmugym.vector.choosing import make_engine, require_own_order
 from fmugym.vector.engines.engine import StepResult
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
@@ -65,17 +64,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     Args:
         make_env: A function without arguments, or a class, that returns a new environment in each
             call; wrappers are refused. It is called once, or once for each environment if hooks are
-            called one environment at a time. Pickles carry it with them.
+            called one by one. Pickles carry it with them.
         num_envs: N.
         max_episode_steps: Truncates episodes; ``gymnasium.make_vec`` passes the spec's.
         autoreset_mode: What follows the end of an episode: ``NEXT_STEP`` (the next step starts an
             episode instead), ``SAME_STEP`` (the same step does; the last observation and info are
             ``infos["final_obs"]`` and ``["final_info"]``) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
-        hooks: The way of calling hooks. ``"auto"`` takes the fastest mode that gives correct
-            results. ``"compiled"`` has the native pool run hooks that can be traced,
-            ``"array"`` calls them once for all environments, ``"per_env"`` one environment at a
-            time; each is an error where it is not possible.
         pool_options: Wishes of ``fmugym.pool.wishes.Wishes``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
@@ -83,8 +78,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: What follows the end of an episode; ``metadata`` has it, too.
 
     Raises:
-        ConfigError: If an argument does not fit, or the hooks cannot be called as asked for. For an
-            unknown argument it is a ``TypeError``, too.
+        ConfigError: If an argument does not fit, or the class overrides ``step`` or ``reset``. For
+            an unknown argument it is a ``TypeError``, too.
         FMULoadError: If the FMU cannot be used on this machine.
     """
 
@@ -107,7 +102,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        hooks: str = "auto",
         **pool_options: Any,
     ) -> None:
         if not callable(make_env):
@@ -116,29 +110,30 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             )
         self.num_envs = checked_num_envs(num_envs)
         self.autoreset_mode = autoreset_mode_of(autoreset_mode)
-        way, limit = check_option("way of calling hooks", hooks, HOOKS), max_episode_steps
+        limit = max_episode_steps
         limit = None if limit is None else check_count("max_episode_steps", limit)
         options = checked_pool_options(pool_options, self.num_envs)
         try:
             self.inside.maker = EnvMaker(make_env)
             self.inside.prototype = self.inside.maker.make()
             require_construction(self.inside.prototype)
-            self._set_up_or_close(way, limit, options)
+            self._set_up_or_close(limit, options)
         except MemoryError:
             raise ConfigError(f"there is not enough memory for num_envs = {num_envs}") from None
 
     def _set_up_or_close(
-        self, hooks: str, max_episode_steps: int | None, pool_options: Mapping[str, Any]
+        self, max_episode_steps: int | None, pool_options: Mapping[str, Any]
     ) -> None:
         env = self.inside.prototype
         try:
+            require_own_order(env)
             self.inside.pool = env.inside.opening.open(
                 self.num_envs, max_episode_steps=max_episode_steps, **pool_options
             )
             try:
                 env.inside.use(self.inside.pool)
                 env.inside.has_chosen = True  # to be stepped by an engine
-                self._set_up(hooks, max_episode_steps)
+                self._set_up(max_episode_steps)
             except BaseException:
                 self.inside.pool.close()
                 raise
@@ -146,10 +141,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             env.close()
             raise
 
-    def _set_up(self, hooks: str, max_episode_steps: int | None) -> None:
+    def _set_up(self, max_episode_steps: int | None) -> None:
         inside, env, count = self.inside, self.inside.prototype, self.num_envs
         inside.limit = EpisodeLimit.of(env).shortened(max_episode_steps)
-        prepare_hooks(env)  # its constructor may have set some as attributes
+        prepare_hooks(env)  # its constructor may have changed the spaces
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = env.render_mode
         self.single_action_space = env.action_space
@@ -159,11 +154,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
         self.closed = False  # which each step reads: faster here than in the class
         self._background = Background()
-        inside.engine = make_engine(inside.maker, env, inside.pool, hooks, max_episode_steps)
+        inside.engine = make_engine(inside.maker, env, inside.pool, max_episode_steps)
         inside.episodes = Episodes(env, inside.engine, inside.pool)
         inside.attributes = Attributes(env, inside.engine, inside.episodes)
         inside.engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
-        inside.pool.forget_health()  # that of the hook check
 
     # Episodes and steps.
 
@@ -259,8 +253,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def step_async(self, actions: Any) -> None:
         """Begin a step of all environments, which goes on while the caller computes.
 
-        The FMUs step in a thread of their own, without the interpreter's lock. Hooks that are not
-        compiled run in this thread, too. Until ``step_wait``, only ``close`` may be called.
+        The FMUs step in a thread of their own, without the interpreter's lock. Hooks in Python run
+        in this thread, too. Until ``step_wait``, only ``close`` may be called.
 
         Args:
             actions: As for ``step``; a copy is made.
@@ -418,7 +412,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """Find out what candidates for the next actions would lead to.
 
         The environments return to their present episodes afterwards, if they have any. Hooks are
-        included. With compiled hooks, one call of the C extension does all steps on all threads.
+        included. Where these are expressions, one call of the C extension does all steps on all
+        threads.
 
         Args:
             snapshot: Where the candidates begin: a snapshot of one environment, or of one for each
@@ -460,7 +455,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     # Single environments.
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Read an attribute, or else a parameter of the FMU, of each environment.
+        """Read an attribute, an episode variable or a parameter of the FMU, of each environment.
 
         Raises:
             ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
@@ -470,11 +465,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return tuple(self.inside.attributes.read(name, range(self.num_envs)))
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute, or a parameter of the FMU, of each environment.
+        """Set an attribute, an episode variable or a parameter of the FMU, of each environment.
 
         Args:
-            name: An attribute that hooks read, or the name of a parameter; a parameter takes effect
-                with the next episode.
+            name: An attribute that hooks read, or the name of a variable or a parameter. A variable
+                has the value now and at the start of episodes; a parameter takes effect with the
+                next episode. Where only expressions run, there are no attributes to set.
             values: A list or array of one value for each environment, or one value for all. Unless
                 hooks are called one environment at a time, values that differ must be numbers.
 

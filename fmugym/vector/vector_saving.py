@@ -121,7 +121,7 @@ def require_fit(columns: Columns) -> None:
     for name in (name for part in attributes for name in part):
         raise ConfigError(
             f"the snapshot has the attribute {name!r}, which the environments of a vector "
-            "environment share; keep it under 'episode_variables', or use hooks='per_env'"
+            "environment share; keep it under 'episode_variables'"
         )
     if isinstance(streams, list) and any(isinstance(stream, dict) for stream in streams):
         raise ConfigError(

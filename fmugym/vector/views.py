@@ -28,8 +28,9 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     space: Any = env.action_space
     action = np.zeros((*space.shape, count), space.dtype)
     variables = EpisodeVariables(env.config.variable_starts)
-    starts = env.config.variable_starts
-    variables.update({name: np.zeros((*np.shape(starts[name]), count)) for name in variables})
+    variables.update({n: np.zeros((*np.shape(v), count)) for n, v in variables.items()})
+    starts = env.inside.draws.variable_starts
+    variables.update({n: np.repeat(start, count, axis=-1) for n, start in starts.items()})
     return Readings(
         values=outputs,
         out=env.out.over(lambda: outputs),

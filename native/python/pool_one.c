@@ -3,29 +3,13 @@
 #include "playing.h"
 
 /* The arguments of step_one; see Pool.step_one in fmugym/_native.pyi. */
-enum { JUDGE, COMPLETE, WATCHED, ACTION, ENVIRONMENT, ARGUMENTS };
+enum { JUDGE, COMPLETE, ACTION, ARGUMENTS };
 
 typedef struct {
     PyTurn turn;
     int64_t number; /* an integer action */
     bool is_refused;
 } Step;
-
-/* Whether the environment still has the attributes that the programs were made of: names and values
- * after each other. An ellipsis stands for one that it must not have. */
-static bool is_as_before(PyObject *watched, PyObject *environment) {
-    const Py_ssize_t size = PyTuple_Size(watched);
-    PyObject *attributes = PyObject_GenericGetDict(environment, NULL);
-    bool same = attributes != NULL;
-
-    for (Py_ssize_t i = 0; i + 1 < size && same; i += 2) {
-        PyObject *value = PyTuple_GetItem(watched, i + 1);
-        PyObject *found = PyDict_GetItemWithError(attributes, PyTuple_GetItem(watched, i));
-        same = found == (value == Py_Ellipsis ? NULL : value);
-    }
-    Py_XDECREF(attributes);
-    return same;
-}
 
 /* Takes an action of exactly the type and shape that the action space has. */
 static bool take_action(const Playing *playing, PyObject *action, Step *s) {
@@ -74,8 +58,8 @@ static PyObject *result_of(const Playing *playing, const ResultArrays *arrays, c
 }
 
 /* Returns the result of the step; None if nothing was done, because the episode has ended, or the
- * action, the inputs that it makes or an attribute are not as they should be. After an exception, the
- * episode does not go on. */
+ * action or the inputs that it makes are not as they should be. After an exception, the episode does
+ * not go on. */
 static PyObject *step_with(PyPool *self, const Playing *playing, PyObject *const *args) {
     uint8_t *ended = playing->form.play.ended;
     ResultArrays arrays;
@@ -83,8 +67,7 @@ static PyObject *step_with(PyPool *self, const Playing *playing, PyObject *const
     PyObject *result = NULL;
 
     clear_turn(playing, &s.turn);
-    s.is_refused = *ended || !is_as_before(args[WATCHED], args[ENVIRONMENT]) ||
-                   !take_action(playing, args[ACTION], &s);
+    s.is_refused = *ended || !take_action(playing, args[ACTION], &s);
     PyErr_Clear();
     if (results_provide_step(playing->results, &arrays)) {
         settle_turn(self, playing, &s.turn);
@@ -106,8 +89,8 @@ PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs)
     if (!has_arguments(nargs, ARGUMENTS) || !is_prepared(self) || !has_results(self)) {
         return NULL;
     }
-    if (self->pool.settings.count != 1 || !PyTuple_Check(args[WATCHED])) {
-        PyErr_SetString(PyExc_TypeError, "step_one needs a tuple, one instance");
+    if (self->pool.settings.count != 1) {
+        PyErr_SetString(PyExc_TypeError, "step_one needs one instance");
         return NULL;
     }
     PyObject *capsule = Py_NewRef(self->playing);

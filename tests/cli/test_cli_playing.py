@@ -167,7 +167,7 @@ class TestBench:
             count = max(1, one["envs"])
             assert one["steps_per_second"] * one["microseconds"] == pytest.approx(count * 1e6)
             assert 0 < one["fmu_share"] <= 1
-            assert one["hooks"] == "compiled"
+            assert one["hooks"] == "expressions"
         assert report["time_step"] == 0.02
 
     def test_parameters_are_drawn_as_resets_draw_them(self, caplog):

@@ -81,7 +81,8 @@ class TestExamples:
     def test_a_vector_environment_equals_that_of_the_class(self, name, mode):
         config = str(EXAMPLES / f"{name}.toml")
         options = {"num_envs": 5, "autoreset_mode": mode}
-        envs = gymnasium.make_vec("fmugym/FMU-v0", config=config, hooks="compiled", **options)
+        envs = gymnasium.make_vec("fmugym/FMU-v0", config=config, **options)
+        assert envs.unwrapped.inside.engine.way == "expressions"
         twins = gymnasium.make_vec(TWINS[name][0], **options)
         envs.action_space.seed(0)
         same(envs.reset(seed=7), twins.reset(seed=7))
@@ -149,9 +150,9 @@ def test_units_reach_observations_actions_and_rewards(load):
     assert env.cost_limits == {"heat": 10.0}
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
-    assert require_same_alone(partial(fmugym.load, TANK), 60, "same_step", hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, TANK), 60, "same_step", way=hooks)
 
 
 def test_samples_over_the_substeps_of_a_step(load):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from vector_tools import require_same_alone
+from ways import in_way
 
 import fmugym
 from fmugym.errors import ConfigError, TaskError
@@ -102,11 +103,11 @@ def test_a_continuous_action_may_change_while_it_is_on():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 def test_many_environments_equal_single_ones_to_the_last_bit(kind, hooks):
     make = partial(fmugym.load, task(kind, history={"of": "u", "length": "0.2s"}))
     method = "action_masks" if "levels" in KINDS[kind] else None
-    require_same_alone(make, 25, method=method, hooks=hooks)
+    require_same_alone(make, 25, method=method, way=hooks)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +160,7 @@ REWARDS = {
 @in_turn(
     {
         "kind": list(REWARDS),
-        "hooks": ["compiled", "array", "per_env"],
+        "hooks": ["expressions", "arrays", "one by one"],
         "mode": ["next_step", "same_step"],
     }
 )
@@ -167,7 +168,7 @@ def test_a_failed_step_costs_no_less_than(kind, hooks, mode, make_envs):
     reward, expected = REWARDS[kind]
     own = {"config": {"fault_reward": -7}} if kind == "the file" else {}
     make = partial(fmugym.load, FAILING | {"reward": reward} | own)
-    envs, single = make_envs(make, 2, hooks=hooks, autoreset_mode=mode), make()
+    envs, single = make_envs(in_way(hooks, make), 2, autoreset_mode=mode), make()
     envs.reset(seed=0)
     single.reset(seed=0)
     for _ in range(2):

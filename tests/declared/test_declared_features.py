@@ -154,10 +154,10 @@ def last(values, first):
 
 
 @pytest.mark.parametrize("declared", ["everything", "two names of a variable"])
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 def test_many_environments_equal_single_ones_to_the_last_bit(hooks, declared):
     task = EVERYTHING if declared == "everything" else TWICE
-    assert require_same_alone(partial(fmugym.load, task), 30, hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, task), 30, way=hooks)
 
 
 CSV = "time;T_C;note\n0;10;a\n3600;20;b\n7200;15;c\n"
@@ -386,7 +386,7 @@ TWICE = BASE | {
 
 
 def test_a_variable_may_have_several_names(load):
-    env = load(TWICE, hooks="compiled")
+    env = load(TWICE, way="expressions")
     assert len(env.config.model_output_names + env.config.monitor_names) == 2
     errors = []
     for seed in range(30):

@@ -55,7 +55,7 @@ def figures(angles, rewards, costs):
 
 
 def test_figures_are_those_of_the_steps(load):
-    env = load(TASK, hooks="compiled")
+    env = load(TASK, way="expressions")
     for seed in (0, None):
         _, info = env.reset(seed=seed)
         assert set(info["kpis"].values()) == {0.0}
@@ -69,10 +69,10 @@ def test_figures_are_those_of_the_steps(load):
         assert cut
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
 def test_figures_of_many_environments(hooks, mode):
-    assert require_same_alone(partial(fmugym.load, TASK), 14, mode, hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, TASK), 14, mode, way=hooks)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from combinations import in_turn
+from ways import in_way
 
 import fmugym
 from fmugym import FMUVectorEnv, Task, TaskEnv
@@ -115,8 +116,8 @@ class TestLimits:
 @pytest.mark.parametrize("kind", ["levels", "late change", "least times"])
 def test_many_environments_are_compiled_and_equal_single_ones(kind):
     make = partial(fmugym.load, formed(TASKS[kind], **FORMS["both"]), physical=True)
-    envs = FMUVectorEnv(make, 2, hooks="compiled")
-    assert envs.inside.engine._task.left == {}
+    envs = FMUVectorEnv(in_way("expressions", make), 2)
+    assert envs.inside.engine.way == "expressions"
     controller = CONTROLLERS["pid"]().bind(envs)
     observations, _ = envs.reset(seed=[3, 4])
     rewards = []

@@ -4,6 +4,7 @@ import os
 import time
 
 import pytest
+from ways import in_way
 
 import fmugym
 from fmugym.expressions.language import Expression
@@ -44,12 +45,12 @@ def fault_of(env):
     return env.step(env.action_space.sample())[-1]["fault"]
 
 
-@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 def test_the_term_its_line_and_the_values_are_named(task, hooks):
     path = task(TERMS)
     with fmugym.load(path) as env:
         single = fault_of(env)
-    envs = fmugym.FMUVectorEnv(lambda: fmugym.load(path), 2, hooks=hooks)
+    envs = fmugym.FMUVectorEnv(in_way(hooks, lambda: fmugym.load(path)), 2)
     several = fault_of(envs)
     envs.close()
     for text in (single, *several):
@@ -131,16 +132,16 @@ COMPUTED_ONCE = {
 
 
 @pytest.mark.parametrize("case", COMPUTED_ONCE)
-@pytest.mark.parametrize("hooks", ["auto", "python"])
-def test_what_many_terms_read_is_computed_once(task, case, hooks):
+@pytest.mark.parametrize("hooks", ["expressions", "Python"])
+def test_what_many_terms_read_is_computed_once(task, case, hooks, load):
     text, count, value = COMPUTED_ONCE[case]
     path = task(REWARD)
     path.write_text(path.read_text().replace(*in_a_row(text, count)) + KPIS)
-    with fmugym.load(path, hooks=hooks) as env:
-        env.reset(seed=0)
-        _, reward, *_, info = env.step(env.action_space.sample())
-        assert reward == value(env.unwrapped.out["theta"])
-        assert info["kpis"]["k49"] == 49 * reward
+    env = load(path, way=hooks)
+    env.reset(seed=0)
+    _, reward, *_, info = env.step(env.action_space.sample())
+    assert reward == value(env.unwrapped.out["theta"])
+    assert info["kpis"]["k49"] == 49 * reward
 
 
 @pytest.mark.parametrize(("text", "count"), [("E + E", 12), ("E if E > 0 else -E", 7)])

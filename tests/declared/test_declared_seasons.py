@@ -81,10 +81,10 @@ def test_a_season_leaves_scenarios_out():
     assert days == {*range(353, 365), *range(3), *range(9, 20)}
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 def test_many_environments_equal_single_ones(hooks):
     task = TASK | {"clock": {"from": "10-01", "to": "04-15", "step": "6h"}}
-    assert require_same_alone(partial(fmugym.load, task), 20, hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, task), 20, way=hooks)
 
 
 SCENARIOS = TASK | {

@@ -269,7 +269,7 @@ COMBINATIONS += [("drop-outs", "late"), ("rate", "lost")]
 @in_turn(
     {
         "sensors,actuators": COMBINATIONS,
-        "hooks": ["compiled", "array", "per_env"],
+        "hooks": ["expressions", "arrays", "one by one"],
         "mode,parameters": {"drawn": ("next_step", DRAWN), "constant": ("same_step", {})},
     }
 )
@@ -277,7 +277,7 @@ def test_many_environments_equal_single_ones(parameters, sensors, actuators, hoo
     history = {"of": ["angle", "tau"], "length": "0.1s"}
     declared = task(parameters, history, **SENSORS[sensors])
     declared["variables"]["tau"] = {"min": -0.01, "max": 0.01} | ACTUATORS[actuators]
-    assert require_same_alone(partial(fmugym.load, declared), 50, mode, hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, declared), 50, mode, way=hooks)
 
 
 @pytest.mark.parametrize(
@@ -390,9 +390,9 @@ def test_mistakes_in_errors_of_forecasts(error, fact):
         forecast_errors(error, 1)
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays", "one by one"])
 def test_random_steps_of_many_environments(hooks):
-    require_same_alone(partial(fmugym.load, RANDOM), 19, hooks=hooks)
+    require_same_alone(partial(fmugym.load, RANDOM), 19, way=hooks)
 
 
 def test_an_argument_that_does_not_exist():

@@ -9,8 +9,6 @@ import test_declared_seasons
 import test_declared_sensors
 import test_declared_warm_up
 
-import fmugym
-
 TASKS = {
     "units and costs": test_declared.TANK,
     "conditions in the memory": test_declared.TANK
@@ -41,8 +39,8 @@ each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 
 
 @each_task
-def test_compiled_steps_are_those_of_python(task):
-    compiled, python = (fmugym.load(task, hooks=hooks) for hooks in ("compiled", "python"))
+def test_compiled_steps_are_those_of_python(task, load):
+    compiled, python = (load(task, way=hooks) for hooks in ("expressions", "Python"))
     python.action_space.seed(4)
     for seed in (1, None):
         test_declared.same(compiled.reset(seed=seed), python.reset(seed=seed))
@@ -52,8 +50,6 @@ def test_compiled_steps_are_those_of_python(task):
             test_declared.same(first, second)
             if first[2] or first[3]:
                 break
-    compiled.close()
-    python.close()
 
 
 @each_task

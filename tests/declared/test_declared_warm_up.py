@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from vector_tools import require_same_alone
+from ways import in_way
 from zoo_tools import parameters, zoo_fmu
 
 import fmugym
@@ -123,7 +124,7 @@ CLOCKS = {"distribution": "choice", "values": [0, 864000.0]}
 
 @in_turn(
     {
-        "hooks,kind": list(product(["compiled", "array", "per_env"], ACTIONS)),
+        "hooks,kind": list(product(["expressions", "arrays", "one by one"], ACTIONS)),
         "mode,caches": {"new": ("next_step", False), "cached": ("same_step", True)},
     }
 )
@@ -133,7 +134,7 @@ def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
     if caches:
         task["warm_up"] = task["warm_up"] | {"cache": True}
         task["parameters"] = {"T_m_0": 291.0}
-    assert require_same_alone(partial(fmugym.load, task), 16, mode, hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, task), 16, mode, way=hooks)
 
 
 @pytest.mark.parametrize("controller", [PID, THERMOSTAT, "schedule 05:00=0.7 21:00=0.3", 0.5])
@@ -213,10 +214,10 @@ class TestCache:
             assert seen == [seen[0]] * len(seen)
         assert env.health["steps"] == 2 * 2 * STEPS
 
-    @pytest.mark.parametrize("hooks", ["compiled", "array"])
+    @pytest.mark.parametrize("hooks", ["expressions", "arrays"])
     def test_one_warm_up_serves_many_environments(self, hooks, load, make_envs):
         task = self.task(clock=["01-15", "07-01 03:00"])
-        envs = make_envs(partial(fmugym.load, task), 6, hooks=hooks)
+        envs = make_envs(in_way(hooks, partial(fmugym.load, task)), 6)
         observations, infos = envs.reset(seed=0)
         assert len(set(infos["drawn"]["clock"])) == 2
         assert envs.health["steps"].sum() == 2 * 2 * STEPS

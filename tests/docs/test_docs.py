@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ways import in_way
 
 import fmugym
 import fmugym.lab
@@ -206,7 +207,7 @@ def test_table_of_shapes_is_what_hooks_see():
     rows = re.findall(r"^\| (`.+?) \| .+ \| .*?(\(.*\)|last axis) \|$", table, re.M)
     expected = {"(outputs, N)": (2, 3), "(inputs, N)": (1, 3), "(N,)": (3,), "last axis": (1, 3)}
     shapes = {code: expected[text] for cell, text in rows for code in re.findall("`(.+?)`", cell)}
-    envs = fmugym.FMUVectorEnv(Watched, 3, hooks="array")
+    envs = fmugym.FMUVectorEnv(in_way("arrays", Watched), 3)
     envs.reset(seed=0)
     envs.step(envs.action_space.sample())
     envs.close()

@@ -267,7 +267,7 @@ class TestEnvironment:
             assert total < -20
 
     def test_many_houses_are_compiled_and_equal_single_ones(self):
-        require_same_alone(HouseEnv, 40, hooks="compiled")
+        require_same_alone(HouseEnv, 40, way="expressions")
 
     def test_a_better_controller_costs_less(self):
         """On weeks that training leaves out: no heating, a thermostat, a PI controller."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from example_tools import EXAMPLES, run_example
 from PIL import Image
+from ways import in_way
 
 PROGRAMS = {
     "lqr_pendulum.py": [],
@@ -48,7 +49,7 @@ class TestIterativeLQR:
     def test_no_torque_alone_is_better(self, plan, example):
         """The plan is a minimum: single torques that are moved make it no cheaper."""
         ilqr = example("ilqr_pendulum")
-        envs = ilqr.fmugym.FMUVectorEnv(ilqr.SwingUp, 40, hooks="compiled")
+        envs = ilqr.fmugym.FMUVectorEnv(in_way("arrays", ilqr.SwingUp), 40)
         envs.reset(seed=0)
         moved = np.repeat(plan.torques[None], 40, axis=0)
         moved[np.arange(40), np.arange(0, 80, 2), 0] += 0.05

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from ways import in_way
 
 import fmugym
 
@@ -38,9 +39,9 @@ def require_powers(state, terms):
     }
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "python"])
+@pytest.mark.parametrize("hooks", ["expressions", "Python"])
 def test_of_one_environment(load, hooks):
-    env = load(TASK, hooks=hooks)
+    env = load(TASK, way=hooks)
     env.reset(seed=1)
     env.action_space.seed(1)
     for _ in range(200):
@@ -48,9 +49,9 @@ def test_of_one_environment(load, hooks):
         require_powers(env.state, info["reward_terms"])
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array"])
+@pytest.mark.parametrize("hooks", ["expressions", "arrays"])
 def test_of_many_environments(make_envs, hooks):
-    envs = make_envs(lambda: fmugym.load(TASK), 64, hooks=hooks)
+    envs = make_envs(in_way(hooks, lambda: fmugym.load(TASK)), 64)
     envs.reset(seed=1)
     envs.action_space.seed(1)
     for _ in range(50):

@@ -3,6 +3,7 @@
 import operator
 
 import pytest
+from ways import in_way
 
 import fmugym
 from fmugym.expressions.quantities import QUANTITIES
@@ -43,9 +44,9 @@ def test_each_has_a_term():
     assert {*TASK["reward"], *ELSEWHERE} == set(QUANTITIES)
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "python"])
+@pytest.mark.parametrize("hooks", ["expressions", "Python"])
 def test_of_one_environment(load, hooks):
-    env = load(TASK, hooks=hooks)
+    env = load(TASK, way=hooks)
     env.reset(seed=1)
     env.action_space.seed(1)
     angles, terminated = set(), False
@@ -59,7 +60,7 @@ def test_of_one_environment(load, hooks):
 
 
 def test_of_many_environments(make_envs):
-    envs = make_envs(lambda: fmugym.load(TASK), 3, hooks="compiled")
+    envs = make_envs(in_way("expressions", lambda: fmugym.load(TASK)), 3)
     envs.reset(seed=1)
     envs.action_space.seed(1)
     for _ in range(15):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS
+from ways import many
 from words_tools import WordsEnv, words_fmu
 
-import fmugym
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.words import as_messages, quoted, telling, unpacked
 
@@ -140,8 +140,8 @@ def test_environments_of_a_vector_say_their_own(tmp_path):
     path = words_fmu(tmp_path, 2, "step")
     at = {"distribution": "choice", "values": [0, 2]}
     for options in ({"threads": 1}, {"threads": 2}, {"isolation": "process", "workers": 2}):
-        options |= {"hooks": "array", "autoreset_mode": "Disabled"}
-        envs = fmugym.FMUVectorEnv(lambda: WordsEnv(path, at=at), 8, **options)
+        options |= {"way": "arrays", "autoreset_mode": "Disabled"}
+        envs = many(lambda: WordsEnv(path, at=at), 8, **options)
         _, infos = envs.reset(seed=1)
         for _ in range(2):
             _, _, _, truncated, infos = envs.step(np.full((8, 1), 0.5, np.float32))

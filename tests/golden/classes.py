@@ -15,6 +15,8 @@ from fmugym import Choice, Uniform
 class BrakeOfPage(fmugym.FMI2CSEnv):
     """Bring a swinging pendulum of unknown mass to rest."""
 
+    vectorized = True
+
     def __init__(self, largest_torque=0.01, **options):
         config = {
             "model_input_names": "tau",
@@ -43,6 +45,8 @@ class BrakeOfPage(fmugym.FMI2CSEnv):
 class BrakeOfExample(BrakeOfPage):
     """The same in the program to copy, with another reward."""
 
+    vectorized = True
+
     def _is_at_rest(self):
         q, q_dot = self.state
         return (abs(q) < 0.05) & (abs(q_dot) < 0.3)
@@ -57,6 +61,8 @@ class BrakeOfExample(BrakeOfPage):
 
 class Brake(fmugym.FMI2CSEnv):
     """The class of the page about hooks; it has an option of its own."""
+
+    vectorized = True
 
     reset_options = ("model_parameters", "release_angle")
 
@@ -82,6 +88,8 @@ class Brake(fmugym.FMI2CSEnv):
 class Discretized(Brake):
     """Three torques, and an observation in which the angle does not jump."""
 
+    vectorized = True
+
     def _get_action_space(self):
         return spaces.Discrete(3)
 
@@ -98,6 +106,8 @@ class Discretized(Brake):
 
 class Track(Brake):
     """Follow a target angle; the integral of the error is observed, too."""
+
+    vectorized = True
 
     def __init__(self, **changes):
         variables = {"target": Uniform(-0.1, 0.1), "error_integral": 0.0}
@@ -122,6 +132,8 @@ class Track(Brake):
 class Delayed(Brake):
     """The torque takes effect three steps later."""
 
+    vectorized = True
+
     def __init__(self, **changes):
         super().__init__(episode_variables={"queue": [0.0, 0.0, 0.0]}, **changes)
 
@@ -135,6 +147,8 @@ class Delayed(Brake):
 
 class Reach(Track):
     """A goal task."""
+
+    vectorized = True
 
     _reward_policy = fmugym.FMUEnv._reward_policy  # the default again, which calls _goal_reward
 
@@ -223,6 +237,8 @@ class Rig(fmugym.FMI2CSEnv):
 class SwingUpOfExample(fmugym.FMI2CSEnv):
     """Reach the upright position from below, and stay there."""
 
+    vectorized = True
+
     def __init__(self):
         plant = {"m": 1.0, "l": 1.0, "g": 10.0, "b": 0.05, "body": 2, "tau_max": 2.0}
         solver = {"solver": 3, "max_step": 0.025}
@@ -262,6 +278,8 @@ class Cell(fmugym.FMUEnv):
 
 class PushedCartPole(fmugym.FMI2CSEnv):
     """A cart-pole that is pushed."""
+
+    vectorized = True
 
     def __init__(self):
         config = {
@@ -308,6 +326,8 @@ class Home(fmugym.FMUEnv):
 class Integral(Brake):
     """An integral and a count in ``_update``; an episode ends after 2, 3, 5 or 40 steps."""
 
+    vectorized = True
+
     def __init__(self):
         last = Choice([2.0, 3.0, 5.0, 40.0])
         super().__init__(episode_variables={"last": last, "total": 0.5, "past": [0.0, 0.0]})
@@ -325,7 +345,7 @@ class Integral(Brake):
 
     def _reward_policy(self):
         ended = 1.0 * self.done
-        return self.variables["total"] - 10.0 * ended + self.previous_action[0]
+        return self.variables["total"] - 10.0 * ended + np.float64(self.previous_action[0])
 
     def _get_observation_space(self):
         return spaces.Box(-np.inf, np.inf, (4,), np.float64)
@@ -340,6 +360,12 @@ class Integral(Brake):
 
 class IntegralOnArrays(Integral):
     """The same with a median, which numpy finds on arrays only."""
+
+    vectorized = True
+
+    def _reward_policy(self):
+        ended = 1.0 * self.done
+        return self.variables["total"] - 10.0 * ended + self.previous_action[0]
 
     def _get_observation(self):
         past = self.variables["past"]
@@ -383,6 +409,8 @@ class Faulty(fmugym.FMUEnv):
         path: The FMU of ``zoo/zoo.c``.
         on_fault: As in the config.
     """
+
+    vectorized = True
 
     def __init__(self, path, on_fault):
         parameters = {name: Choice(values) for name, values in PARAMETERS.items()}
@@ -430,6 +458,8 @@ class Faulty(fmugym.FMUEnv):
 
 class FaultyOnArrays(Faulty):
     """The same with a function that is not compiled."""
+
+    vectorized = True
 
     def _get_info(self):
         return {"total": np.nansum(np.array([self.variables["total"]]), axis=0)}

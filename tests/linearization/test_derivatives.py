@@ -14,6 +14,8 @@ HORIZON = 12
 class Precise(fmugym.FMUEnv):
     """The point mass by explicit Euler, one internal step for each step, seen as float64."""
 
+    vectorized = True
+
     version = "2.0"
     plant = {  # noqa: RUF012  (nothing changes it)
         "m": M,

@@ -10,6 +10,7 @@ from combinations import in_turn
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from test_derivatives import DT, HORIZON, B, G, L, M, Precise
+from ways import in_way
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
@@ -116,6 +117,8 @@ class TestDifferences:
         gain = 0.01
 
         class Damped(Precise):
+            vectorized = True
+
             def _get_inputs(self):
                 return 0.5 * self.action - gain * self.out["q_dot"]
 
@@ -386,7 +389,7 @@ def test_present_episodes_go_on():
     twin.close()
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_in_the_middle_of_an_episode(hooks):
     """A step count, a previous action and drawn parameters are those of the snapshot."""
 
@@ -402,7 +405,7 @@ def test_in_the_middle_of_an_episode(hooks):
         env.step(np.full(1, 0.01, np.float32))
         env.step(np.full(1, 0.01, np.float32))
         snapshot, drawn = env.save_state(), env.parameters["b"]
-    envs = vector_of(Drawn, 8, hooks=hooks)
+    envs = vector_of(in_way(hooks, Drawn), 8)
     found = linearize_along(envs, snapshot, TORQUES, states=STARTS)
     envs.close()
     assert found.A[:, 1, 1] == pytest.approx(1 - DT * drawn / (M * L**2), abs=1e-8)

@@ -13,6 +13,7 @@ from combinations import in_turn
 from process_tools import run_python
 from program_tools import DISCRETE, code, uniform_draws
 from test_native_pool import LOG, make, on_linux
+from ways import in_way
 
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
@@ -77,7 +78,7 @@ class TestArrays:
             counting_in(counts)
 
     def test_actions_that_are_not_aligned(self, make_envs):
-        with_these, with_others = (make_envs(CartPoleEnv, 6, hooks="compiled") for _ in range(2))
+        with_these, with_others = (make_envs(in_way("arrays", CartPoleEnv), 6) for _ in range(2))
         actions = misaligned(6, np.int64)
         actions[:] = [0, 1, 0, 1, 1, 0]
         for envs in (with_these, with_others):

@@ -21,6 +21,7 @@ from gymnasium import spaces
 from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 from test_native_pool import busy_fmu, make
+from ways import in_way
 
 from fmugym import FMU, SimulationError
 from fmugym.pool import PoolSpec
@@ -338,9 +339,9 @@ class Talkative(PlainEnv):
         return 0.5 * self.action
 
 
-@in_turn({"hooks": ["compiled", "array"], "error": [KeyboardInterrupt(), ValueError("!")]})
+@in_turn({"hooks": ["arrays"], "error": [KeyboardInterrupt(), ValueError("!")]})
 def test_an_exception_does_not_repeat_a_step_of_a_vector_environment(probe, hooks, error):
-    with contextlib.closing(FMUVectorEnv(lambda: Talkative(probe()), 2, hooks=hooks)) as envs:
+    with contextlib.closing(FMUVectorEnv(in_way(hooks, lambda: Talkative(probe())), 2)) as envs:
         envs.reset()
         handler = Raising(error, at=2)
         logger = envs.get_attr("logger")[0]

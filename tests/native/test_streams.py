@@ -7,6 +7,7 @@ import pytest
 from combinations import in_turn
 from gymnasium.utils import seeding
 from vector_tools import HOOKS, Drawing
+from ways import in_way
 
 from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
@@ -211,7 +212,7 @@ MIXED = {
 def test_every_distribution_in_episodes(own, hooks, make_envs):
     """Environment i, seeded with s, draws what a single environment seeded with s + i draws."""
     parameters = {**MIXED, "q_dot_0": OwnUniform(0.1, 0.4)} if own else MIXED
-    envs = make_envs(lambda: Drawing(model_parameters=parameters), 3, hooks=hooks)
+    envs = make_envs(in_way(hooks, lambda: Drawing(model_parameters=parameters)), 3)
     single = Drawing(model_parameters=parameters)
     infos = [envs.reset(seed=40)[1], *(envs.reset()[1] for _ in range(4))]
     for index in range(3):
@@ -241,8 +242,8 @@ class BareDrawing(Drawing):
 def test_every_distribution_in_the_pass(own):
     parameters = {**MIXED, "q_dot_0": OwnUniform(0.1, 0.4)} if own else MIXED
     ways = [
-        FMUVectorEnv(lambda: BareDrawing(model_parameters=parameters), 5, hooks=hooks)
-        for hooks in ("compiled", "per_env")
+        FMUVectorEnv(in_way(hooks, lambda: BareDrawing(model_parameters=parameters)), 5)
+        for hooks in ("arrays", "one by one")
     ]
     first, second = (envs.reset(seed=1)[0] for envs in ways)
     ways[0].action_space.seed(0)
@@ -260,7 +261,7 @@ def test_every_distribution_in_the_pass(own):
 def test_a_refused_step_draws_nothing(make_envs):
     parameters = {"q_0": OwnUniform(0.1, 0.4)}
     envs, twins = (
-        make_envs(lambda: BareDrawing(model_parameters=parameters), 2, hooks="compiled")
+        make_envs(in_way("arrays", lambda: BareDrawing(model_parameters=parameters)), 2)
         for _ in range(2)
     )
     for each in (envs, twins):

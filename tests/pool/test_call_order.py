@@ -78,7 +78,7 @@ class Machine(RuleBasedStateMachine):
         retries=st.sampled_from([0, 2]),
         substeps=st.sampled_from([1, 2]),
         mode=st.sampled_from(["next_step", "same_step", "disabled"]),
-        hooks=st.sampled_from(["array", "per_env"]),
+        way=st.sampled_from(["arrays", "one by one"]),
     )
     def begin(self, retries, substeps, mode, hooks):
         self.options = {"substeps": substeps, "fault_retries": retries if self.version > 1 else 0}

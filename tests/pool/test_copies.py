@@ -14,6 +14,7 @@ from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 from test_snapshot_machine import Machine
 from test_snapshots import ACTIONS, POOLS, Track, play, play_vector
+from ways import in_way
 from zoo_tools import resident_bytes
 
 import fmugym
@@ -148,9 +149,10 @@ def test_after_a_fault_it_is_played_again(copying, caplog):
         assert play(env) == expected
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "per_env"])
+@pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_any_order(copying, hooks):
-    machine = type("Own", (Machine,), {"options": {"hooks": hooks}, "make": copying})
+    body = {"make": copying, "make_many": staticmethod(in_way(hooks, copying))}
+    machine = type("Own", (Machine,), body)
     limits = settings(max_examples=15, stateful_step_count=25, deadline=None)
     run_state_machine_as_test(machine, settings=limits)
 

@@ -7,6 +7,7 @@ from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS
 from gymnasium import spaces
 from pool_tools import KINDS, open_pool, reset
+from ways import in_way
 
 from fmugym import FMU, ConfigError, SimulationError
 from fmugym.fmi import Status
@@ -70,7 +71,7 @@ class TestFiniteInputs:
         assert status.tolist() == [Status.OK, Status.NOT_FINITE]
         assert outputs.tolist() == [[0.8, 0.8]]
 
-    @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+    @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_made_by_a_hook_from_integer_actions(self, lawful, opened, hooks):
         class Dividing(lawful_tools.LawfulEnv):
             def _get_action_space(self):
@@ -79,7 +80,7 @@ class TestFiniteInputs:
             def _get_inputs(self):
                 return 1.0 / self.action
 
-        envs = opened(FMUVectorEnv(lambda: Dividing(lawful[2]), 2, hooks=hooks))
+        envs = opened(FMUVectorEnv(in_way(hooks, lambda: Dividing(lawful[2])), 2))
         envs.reset(seed=0)
         with np.errstate(divide="ignore"), pytest.raises(ConfigError, match=r"finite"):
             envs.step(np.array([1, 0]))

@@ -32,7 +32,7 @@ LENGTHS = (3, 12, 12, 5)
 NUM_ENVS = 3
 WAYS = {
     **{f"{threads} threads": {"threads": threads} for threads in (1, 2, 3)},
-    "per env": {"hooks": "per_env"},
+    "per env": {"way": "one by one"},
     **{f"{n} workers": {"isolation": "process", "workers": n} for n in (1, 2)},
     "default": {},
 }

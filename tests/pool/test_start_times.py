@@ -110,7 +110,7 @@ def test_each_instance_begins_at_its_own_time(make_pool, kind, interface, versio
 class Sun(FMUEnv):
     """Reads the time in all hooks."""
 
-    def __init__(self, path, hooks="auto", isolation=None, **config):
+    def __init__(self, path, isolation=None, **config):
         config = {
             "model_input_names": [],
             "model_output_names": ["x", "now", "sine"],
@@ -120,7 +120,7 @@ class Sun(FMUEnv):
             "max_episode_steps": 5,
             "start_time": Uniform(0, 100),
         } | config
-        super().__init__(path, grouped(config), hooks=hooks, isolation=isolation)
+        super().__init__(path, grouped(config), isolation=isolation)
 
     def _get_action_space(self):
         return gymnasium.spaces.Box(-1, 1, (1,), np.float32)
@@ -412,14 +412,14 @@ def test_recorded_times_are_those_of_the_fmu(task, tmp_path):
 
 @in_turn(
     {
-        "hooks": ["compiled", "array", "per_env"],
+        "hooks": ["arrays", "one by one"],
         "warm_up": [{"period": "12h", "controller": 0.5, "cache": True}, 0],
     }
 )
 def test_vectors_of_tasks_equal_single_ones(task, hooks, warm_up):
     task = task | {"start_time": {"from": "10-01", "to": "10-03", "step": "6h"}}
     task |= {"warm_up": warm_up} if warm_up else {}
-    assert require_same_alone(partial(fmugym.load, task), 25, hooks=hooks)
+    assert require_same_alone(partial(fmugym.load, task), 25, way=hooks)
 
 
 @pytest.mark.parametrize(

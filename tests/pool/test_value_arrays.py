@@ -172,7 +172,7 @@ def test_hooks_on_arrays_of_environments(state_space):
             model_parameters={"x_0": [1, Uniform(0, 1)], "A": [[-1, 0.5], [0, -2]]},
         )
 
-    require_same_alone(make, 3, hooks="array")
+    require_same_alone(make, 3, way="arrays")
 
 
 @pools

@@ -13,6 +13,7 @@ import pytest
 import values_tools
 from gymnasium import spaces
 from scipy import linalg
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError
@@ -270,13 +271,13 @@ class TestArena:
             assert arena.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
 
     @pytest.mark.parametrize("most_envs", [512, 7])
-    @pytest.mark.parametrize("kind", ["compiled", "arrays", "per_env", "own_step", "process"])
+    @pytest.mark.parametrize("kind", ["arrays", "one by one", "own_step", "process"])
     def test_no_episode_is_stepped_beyond_its_end(self, kind, most_envs):
         """The FMUs do as many steps as the episodes in single environments have."""
         make = {
             "compiled": load(),
             "arrays": Sorted,
-            "per_env": Branching,
+            "one by one": Branching,
             "own_step": Stepping,
             "process": partial(fmugym.load, fmugym.Task.from_dict(FALLING), isolation="process"),
         }[kind]
@@ -639,10 +640,10 @@ class BlockedPair(Blocked):
 
 class TestMasks:
     @pytest.mark.parametrize("kind", [Blocked, BlockedPair])
-    @pytest.mark.parametrize("hooks", ["compiled", "per_env"])
+    @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_are_respected_where_choices_are_made(self, kind, hooks):
         chosen, allowed = [], []
-        with closing(kind()) as one, closing(FMUVectorEnv(kind, 6, hooks=hooks)) as envs:
+        with closing(kind()) as one, closing(FMUVectorEnv(in_way(hooks, kind), 6)) as envs:
             policy = policy_with(FORMS[1], one, rows=6).bind(envs)
             observations, _ = envs.reset(seed=3)
             for _ in range(8):

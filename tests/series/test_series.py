@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from letters import wide
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError
@@ -142,8 +143,8 @@ class TestSingle:
 
     def test_the_rows_of_compiled_steps(self, load):
         config = TASK | {"episode_length": "1s"}
-        compiled = RecordSeries(load(config, hooks="compiled"))
-        plain = RecordSeries(load(config, hooks="python"))
+        compiled = RecordSeries(load(config, way="expressions"))
+        plain = RecordSeries(load(config, way="Python"))
         for env in (compiled, plain):
             played(env, 1, 60)
             env.step(np.array([0.01, 0.5], np.float32))
@@ -206,9 +207,9 @@ class TestSingle:
             _ = env.series
 
 
-@in_turn({"hooks": ["compiled", "array", "per_env"], "mode": ["next_step", "same_step"]})
+@in_turn({"hooks": ["expressions", "arrays", "one by one"], "mode": ["next_step", "same_step"]})
 def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode, record, make_envs):
-    envs = make_envs(make, 3, hooks=hooks, autoreset_mode=mode)
+    envs = make_envs(in_way(hooks, make), 3, autoreset_mode=mode)
     wanted = ["*", "observation.*"]
     many = RecordVectorSeries(envs, wanted, environments=[0, 2])
     many.action_space.seed(5)

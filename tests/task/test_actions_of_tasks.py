@@ -33,14 +33,14 @@ TASKS = {
 WRONG = [[1, 2, 3], np.zeros(3), [], np.zeros(0), "a", ["a"], None, {}, [[0, 0, 0]], [0.0, True]]
 
 
-@pytest.fixture(params=["auto", "python"])
+@pytest.fixture(params=["expressions", "Python"])
 def hooks(request):
     return request.param
 
 
 @pytest.fixture(params=TASKS.values(), ids=TASKS)
 def env(request, hooks, load):
-    env = load(request.param, hooks=hooks)
+    env = load(request.param, way=hooks)
     env.reset(seed=0)
     return env
 
@@ -64,7 +64,7 @@ def test_one_value_of_any_form_is_taken(env, action):
 
 @pytest.mark.parametrize("action", [True, False, np.True_, np.False_])
 def test_truths_choose_of_two_levels(action, hooks, load):
-    env = load(LEVELS, hooks=hooks)
+    env = load(LEVELS, way=hooks)
     env.reset(seed=0)
     expected = env.step(int(action))[0]
     env.reset(seed=0)
@@ -73,7 +73,7 @@ def test_truths_choose_of_two_levels(action, hooks, load):
 
 @pytest.mark.parametrize("action", [np.array(True), np.float32(1.0), "a", [True], None, 2])
 def test_other_things_choose_no_level(action, hooks, load):
-    env = load(LEVELS, hooks=hooks)
+    env = load(LEVELS, way=hooks)
     env.reset(seed=0)
     with pytest.raises(ConfigError, match="not in Discrete"):
         env.step(action)

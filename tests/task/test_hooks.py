@@ -10,6 +10,7 @@ from combinations import in_turn
 from fmu_tools import PlainEnv
 from gymnasium import spaces
 from vector_tools import Drawing
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -284,7 +285,7 @@ class TestSuperOfObservation:
         env.reset()
         assert env.observation_space.contains(env.step(0.3)[0])
 
-    @pytest.mark.parametrize("hooks", ["array", "per_env"])
+    @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_in_a_vector_environment(self, probe, hooks, make_envs):
         class Longer(PlainEnv):
             def __init__(self):
@@ -299,7 +300,7 @@ class TestSuperOfObservation:
             def _get_observation(self):
                 return np.concatenate([super()._get_observation(), np.float32(self.state)])
 
-        envs = make_envs(Longer, 3, hooks=hooks)
+        envs = make_envs(in_way(hooks, Longer), 3)
         envs.reset()
         observations, *_ = envs.step(np.float32([[0.1], [0.2], [0.3]]))
         assert observations.tolist() == [[value] * 2 for value in observations[:, 0]]
@@ -395,7 +396,7 @@ class TestGoals:
             assert (reward, observation["achieved_goal"]) == (-5.0, env.state[0])
 
     def test_so_does_a_step_on_arrays(self):
-        with contextlib.closing(fmugym.FMUVectorEnv(SpoiledGoals, 3, hooks="array")) as envs:
+        with contextlib.closing(fmugym.FMUVectorEnv(in_way("arrays", SpoiledGoals), 3)) as envs:
             envs.reset(seed=0)
             CALLS.clear()
             observations, rewards, *_ = envs.step(envs.action_space.sample())

@@ -9,6 +9,7 @@ from combinations import in_turn
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 from test_snapshots import Track
+from ways import in_way
 
 import fmugym
 
@@ -35,12 +36,12 @@ class Machine(RuleBasedStateMachine):
     """Each environment has a history of its own; a snapshot carries that of its environments."""
 
     options: dict = {}  # noqa: RUF012  (of subclasses)
-    make = Track
+    make = make_many = Track
 
     @initialize(seed=st.integers(0, 5))
     def start(self, seed):
         self.envs = fmugym.FMUVectorEnv(
-            self.make,
+            self.make_many,
             N,
             autoreset_mode="Disabled",
             **self.options,
@@ -129,9 +130,8 @@ class Machine(RuleBasedStateMachine):
 
 
 WAYS = {
-    "compiled": {"hooks": "compiled", "threads": 2},
-    "array": {"hooks": "array", "threads": 1},
-    "per_env": {"hooks": "per_env"},
+    "arrays": {"threads": 1},
+    "one by one": {"threads": 2},
     "processes": {"isolation": "process", "workers": 2},
 }
 
@@ -142,7 +142,9 @@ CHANGES = ({"substeps": 3, "warm_up": 0.06, "start_time": 0.3}, {})
 @in_turn({"way": list(WAYS), "version": ["2.0", "3.0", "1.0"], "changes": CHANGES})
 def test_any_order(version, way, changes):
     make = staticmethod(partial(Track, version, **changes))
-    machine = type("Own", (Machine,), {"options": WAYS[way], "make": make})
+    hooks = way if way in ("arrays", "one by one") else None
+    body = {"options": WAYS[way], "make": make, "make_many": staticmethod(in_way(hooks, make))}
+    machine = type("Own", (Machine,), body)
     examples = 4 if way == "processes" else 25
     limits = settings(max_examples=examples, stateful_step_count=25, deadline=None)
     run_state_machine_as_test(machine, settings=limits)

@@ -12,6 +12,7 @@ import pytest
 from combinations import in_turn
 from demanding_tools import DemandingEnv, make_fmu
 from fmu_tools import PlainEnv, grouped, probe_config
+from ways import in_way
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
@@ -30,7 +31,7 @@ ACTIONS = np.random.default_rng(5).uniform(-1, 1, (60, 1)).astype(np.float32)
 class Track(fmugym.FMI2CSEnv):
     """Follow a target that moves; an integral, a history, drawn values and short episodes."""
 
-    def __init__(self, fmi_version="2.0", backend=None, hooks="auto", isolation=None, **changes):
+    def __init__(self, fmi_version="2.0", backend=None, isolation=None, **changes):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
@@ -46,7 +47,7 @@ class Track(fmugym.FMI2CSEnv):
             "max_episode_steps": 12,
         }
         fmu = fmugym.bundled_fmu("Pendulum", fmi_version)
-        options = {"backend": backend, "hooks": hooks, "isolation": isolation}
+        options = {"backend": backend, "isolation": isolation}
         super().__init__(fmu, grouped(config | changes), **options)
 
     fmi_version = None
@@ -136,18 +137,6 @@ class TestSingle:
         assert play(other) == play(env)
         other.close()
 
-    @pytest.mark.parametrize("ways", [("compiled", "python"), ("python", "compiled")])
-    def test_compiled_hooks_go_on_as_those_in_python(self, halfway, ways):
-        first, second = (halfway(hooks=way) for way in ways)
-        assert first.save_state() == second.save_state()
-        expected = play(first)
-        second.restore_state(halfway(hooks=ways[0]).save_state())
-        assert play(second) == expected
-        snapshot = first.save_state()
-        expected = play(first)
-        first.restore_state(snapshot)
-        assert play(first) == expected
-
     @pytest.mark.parametrize("version", VERSIONS)
     def test_deep_copies_are_in_the_same_episode(self, halfway, version):
         env = halfway(fmi_version=version)
@@ -186,7 +175,7 @@ class TestSingle:
             env.restore_state(snapshot)
             assert env.step(1)[1] == 2.0
             with pytest.raises(ConfigError, match="pushes"):
-                vector_of(CartPoleEnv, 2, hooks="array").restore_state(snapshot)
+                vector_of(in_way("arrays", CartPoleEnv), 2).restore_state(snapshot)
 
     def test_after_a_fault_only_a_reset_can_follow(self, make_env):
         env = make_env(model_parameters={"fault": 3, "fault_step": 2})
@@ -216,9 +205,9 @@ class TestVector:
         assert again.observations.tolist() == expected.observations.tolist()
         assert again.rewards.tolist() == [0.0, 0.0]
 
-    @pytest.mark.parametrize("hooks", ["compiled", "array"])
+    @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_parameters_from_options_are_restored(self, hooks, vector_of):
-        envs = vector_of(Track, 2, hooks=hooks)
+        envs = vector_of(in_way(hooks, Track), 2)
         envs.reset(seed=0, options={"model_parameters": {"b": 1e-3, "m": 0.2}})
         envs.step(np.ones((2, 1), np.float32))
         snapshot = envs.save_state()

@@ -6,6 +6,7 @@ import pytest
 from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config, probe_fmu
 from gymnasium import spaces
+from ways import in_way
 
 from fmugym import ConfigError, FMUVectorEnv, SimulationError
 
@@ -170,13 +171,13 @@ class TestObservations:
 
         def observe(hooks):
             config = probe_config(model_output_names=name)
-            envs = FMUVectorEnv(lambda: PlainEnv(probe(), config), 3, hooks=hooks)
+            envs = FMUVectorEnv(in_way(hooks, lambda: PlainEnv(probe(), config)), 3)
             observations = [envs.reset()[0]]
             observations += [envs.step(np.zeros((3, 1)))[0] for _ in range(3)]
             envs.close()
             return [(row.tolist(), row.dtype) for row in observations]
 
-        assert observe("array") == observe("per_env")
+        assert observe("arrays") == observe("one by one")
 
     def test_observations_are_new_arrays(self, make_env):
         env = make_env()

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 from vector_tools import Drawing
+from ways import in_way
 
 import fmugym
 
@@ -70,7 +71,7 @@ def test_of_one_environment():
 
 
 def test_on_arrays(make_envs):
-    env = make_envs(Recording, 3, hooks="array")
+    env = make_envs(in_way("arrays", Recording), 3)
     called, values = played(env, np.zeros((3, 1), np.float32))
     assert called == [*ORDER, *ORDER]
     assert values == EXPECTED
@@ -78,7 +79,7 @@ def test_on_arrays(make_envs):
 
 def test_one_environment_at_a_time(make_envs):
     """The FMUs step between the first hook of all environments and the others."""
-    env = make_envs(Recording, 3, hooks="per_env")
+    env = make_envs(in_way("one by one", Recording), 3)
     called, values = played(env, np.zeros((3, 1), np.float32))
     step = [ORDER[0]] * 3 + [*ORDER[1:]] * 3
     assert called == [*step, *step]

@@ -16,6 +16,7 @@ from values_tools import (
     pools,
 )
 from vector_tools import require_same_alone
+from ways import in_way
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
@@ -80,7 +81,7 @@ def test_a_string_is_drawn_for_each_episode(feedthrough, version, options):
     env.close()
 
 
-HOOKED = [(Reading, "compiled"), (Telling, "auto"), (Telling, "array"), (Telling, "per_env")]
+HOOKED = [(Reading, "arrays"), (Telling, "arrays"), (Telling, "one by one")]
 
 
 @in_turn(
@@ -90,11 +91,10 @@ HOOKED = [(Reading, "compiled"), (Telling, "auto"), (Telling, "array"), (Telling
     }
 )
 def test_vector_environments_draw_what_single_ones_do(feedthrough, options, mode, cls, hooks):
-    """Compiled hooks draw numbers; ``Telling`` has one hook in Python."""
     drawn = {"String_parameter": CHOICE, "Float64_parameter": Uniform(0, 1)}
     config = {"model_parameters": drawn, "model_output_names": ["length", "Float64_told"]}
     make = partial(cls, feedthrough[3], max_episode_steps=2, **config, **options)
-    assert require_same_alone(make, 9, mode, hooks=hooks)
+    assert require_same_alone(make, 9, mode, way=hooks)
 
 
 @pools
@@ -113,9 +113,9 @@ def test_a_text_for_one_episode(feedthrough, options):
     env.close()
 
 
-@in_turn({"hooks": ["auto", "array", "per_env"], "options": POOLS})
+@in_turn({"hooks": ["arrays", "one by one"], "options": POOLS})
 def test_each_environment_has_its_own_text(feedthrough, options, hooks, make_envs):
-    envs = make_envs(lambda: Telling(feedthrough[3], words="abc", **options), 3, hooks=hooks)
+    envs = make_envs(in_way(hooks, lambda: Telling(feedthrough[3], words="abc", **options)), 3)
     assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]
     envs.set_attr("String_parameter", ["a", "bbbb", "cc"])
     for _ in range(2):
@@ -143,9 +143,9 @@ def test_texts_that_only_one_reset_knows_take_turns(feedthrough, options):
     env.close()
 
 
-@in_turn({"hooks": ["array", "per_env"], "options": POOLS})
+@in_turn({"hooks": ["arrays", "one by one"], "options": POOLS})
 def test_texts_for_one_episode_of_each_environment(feedthrough, options, hooks, make_envs):
-    envs = make_envs(lambda: Telling(feedthrough[3], words="abc", **options), 5, hooks=hooks)
+    envs = make_envs(in_way(hooks, lambda: Telling(feedthrough[3], words="abc", **options)), 5)
     idle = np.zeros(5, np.int64)
 
     def texts():
@@ -215,12 +215,12 @@ class Alternating:
         return self.values[int(rng.random() < 0.5)]
 
 
-@pytest.mark.parametrize("hooks", ["auto", "per_env"])
+@pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_a_distribution_of_the_users_own(feedthrough, hooks, make_envs):
     def make():
         return Reading(feedthrough[3], words=Alternating(), max_episode_steps=1)
 
-    envs = make_envs(make, 2, hooks=hooks)
+    envs = make_envs(in_way(hooks, make), 2)
     streams = [np.random.default_rng(seed) for seed in (8, 9)]
     envs.reset(seed=8)
     wanted = [[1 + (one.random() < 0.5) for _ in range(4)] for one in streams]

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from ways import in_python
 
 from fmugym import SimulationError
 from fmugym.envs import CartPoleEnv
@@ -16,7 +17,9 @@ from fmugym.envs import CartPoleEnv
 MANY = 1000
 """Calls that take longer than an interrupt takes to come."""
 
-OPTIONS = [{"hooks": "compiled"}, {"hooks": "python"}, {"isolation": "process"}]
+MADE = {"as it is": CartPoleEnv, "in Python": lambda: in_python(CartPoleEnv())}
+MADE["isolated"] = lambda: CartPoleEnv(isolation="process")
+each_kind = pytest.mark.parametrize("make", MADE.values(), ids=MADE)
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*after the end of the episode")
 
@@ -38,24 +41,18 @@ def calls_of(env, snapshot):
     ]
 
 
-def begin(env, hooks):
-    env.reset(seed=0)
-    assert (env.inside.player is None) == (hooks == "python")
-    return env
-
-
-@pytest.mark.parametrize("options", OPTIONS)
-def test_threads_at_once_leave_it_whole(options):
-    env = CartPoleEnv(**options)
+@each_kind
+def test_threads_at_once_leave_it_whole(make):
+    env = make()
     env.reset(seed=0)
     call_at_once(calls_of(env, env.save_state()))
     require_whole(env)
 
 
-@pytest.mark.parametrize("options", OPTIONS)
-def test_a_thread_may_close_it_meanwhile(options):
+@each_kind
+def test_a_thread_may_close_it_meanwhile(make):
     for _ in range(10):
-        env = CartPoleEnv(**options)
+        env = make()
         env.reset(seed=0)
         calls = calls_of(env, env.save_state())
         closer = threading.Timer(0.01, env.close)
@@ -89,7 +86,7 @@ def run_together(functions):
 
 def require_whole(env):
     """It plays as a new one does, also in another thread."""
-    with contextlib.closing(type(env)(hooks="python")) as other:
+    with contextlib.closing(in_python(CartPoleEnv())) as other:
         results = [[], []]
         for one, into in zip((env, other), results, strict=True):
             run_together([lambda one=one, into=into: into.extend(play_some(one))])
@@ -134,9 +131,9 @@ def interrupt(play, arguments):
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
-@pytest.mark.parametrize("hooks", ["auto", "python"])
-def test_interrupts_leave_it_whole(hooks):
-    env = CartPoleEnv(hooks=hooks)
+@pytest.mark.parametrize("make", [CartPoleEnv, MADE["in Python"]], ids=["as it is", "in Python"])
+def test_interrupts_leave_it_whole(make):
+    env = make()
     env.reset(seed=0)
     calls = calls_of(env, env.save_state())
     steps = [lambda: env.reset(seed=1), *[lambda: env.step(1)] * 5]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from ways import in_way
 
 import fmugym
 from fmugym import Uniform
@@ -22,7 +23,7 @@ IDS = (
     "fmugym/CloudPendulum-v0",
 )
 ABSURD = 1e308
-HOOKS = ("array", "per_env", "auto")
+HOOKS = ("arrays", "one by one")
 each_way = pytest.mark.parametrize("hooks", HOOKS)
 each_mode = pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
 CART_POLE = fmugym.envs.CartPoleEnv
@@ -144,8 +145,8 @@ def run_side_by_side(ours, theirs, steps=60, method=None, **options):
     return ends
 
 
-def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, hooks="array", **kw):
-    ours = FMUVectorEnv(lambda: cls(**kw), num_envs, autoreset_mode=mode, hooks=hooks)
+def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, way="arrays", **kw):
+    ours = FMUVectorEnv(in_way(way, lambda: cls(**kw)), num_envs, autoreset_mode=mode)
     theirs = SyncVectorEnv([lambda: cls(**kw)] * num_envs, autoreset_mode=mode)
     return ours, theirs
 
@@ -154,15 +155,15 @@ def require_pair_equal(cls, steps=60, mode=AutoresetMode.NEXT_STEP, rtol=0.0, **
     return run_side_by_side(*make_pair(cls, mode, **keywords), steps, rtol=rtol)
 
 
-def require_same_alone(make, steps, mode="next_step", method=None, **options):
+def require_same_alone(make, steps, mode="next_step", method=None, way=None, **options):
     """Three environments give what single ones give, to the last bit; returns how many ends.
 
-    With compiled hooks, none is left to Python. A method is called after each step.
+    Their hooks are called in a way; None stands for that of the class. A method is called after
+    each step.
     """
     mode = AutoresetMode[mode.upper()]
-    ours = FMUVectorEnv(make, 3, autoreset_mode=mode, **options)
-    if options.get("hooks") == "compiled":
-        assert ours.inside.engine._task.left == {}
+    ours = FMUVectorEnv(in_way(way, make), 3, autoreset_mode=mode, **options)
+    assert way in (None, ours.inside.engine.way)
     theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
     return run_side_by_side(ours, theirs, steps, method)
 
@@ -183,6 +184,26 @@ class Drawing(fmugym.FMUEnv):
 
     def _is_done(self):
         return self.state[0] != self.state[0]
+
+
+class Pushed(Drawing):
+    """Two actions and a monitored variable, for hooks of all kinds."""
+
+    space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, **changes):
+        parameters = {"q_0": Uniform(-1.0, 1.0), "q_dot_0": Uniform(-0.5, 0.5)}
+        config = {"model_parameters": parameters, "max_episode_steps": 7}
+        super().__init__(**(config | {"monitor_names": ["theta_ddot"]} | changes))
+
+    def _get_action_space(self):
+        return self.space
+
+    def _get_inputs(self):
+        return [0.01 * np.sum(self.action, axis=0, dtype=np.float64)]
+
+    def _is_done(self):
+        return self.state[0] > 0.8
 
 
 class Remembering(Drawing):

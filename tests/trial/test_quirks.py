@@ -20,6 +20,7 @@ import quirk_table
 from combinations import in_turn
 from fmu_tools import grouped
 from quirk_table import OUTPUTS, QUIRKS
+from ways import in_way
 
 import fmugym
 from fmugym.errors import ContractError
@@ -96,10 +97,9 @@ def assert_right(env, path):
 
 def make_vector(path, quirk, gain=None, **options):
     return fmugym.FMUVectorEnv(
-        lambda: QuirkEnv(path, gain, **config_of(quirk)),
+        in_way("arrays", lambda: QuirkEnv(path, gain, **config_of(quirk))),
         NUM_ENVS,
         autoreset_mode="Disabled",
-        hooks="array",
         **options,
     )
 

@@ -5,12 +5,15 @@ from functools import partial
 import numpy as np
 import pytest
 from letters import wide
-from test_rollouts import WAYS, rows_of
+from test_rollouts import WAYS as OF_CLASSES
+from test_rollouts import rows_of
 from test_snapshots import Track
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError
 
+WAYS = {"expressions": {}, **OF_CLASSES}
 HOUR, DT, STEPS, N = 3600.0, 600.0, 20, 3
 TIMES = np.arange(24) * HOUR
 OWN = np.linspace(0.0, 0.023, 24)
@@ -67,7 +70,7 @@ def root(task, steps=2):
 
 @pytest.fixture
 def environments(vector_of):
-    def make(task, way="compiled", count=2):
+    def make(task, way="expressions", count=2):
         return vector_of(lambda: fmugym.load(task), count, **WAYS[way])
 
     return make
@@ -180,16 +183,6 @@ class TestOffsets:
         with pytest.raises(ConfigError, match=reason):
             envs.rollout(root(spinning())[0], pushes(), offsets=offsets)
 
-    def test_do_not_reach_a_step_of_a_class(self, vector_of):
-        class Own(Track):
-            def step(self, action):
-                return super().step(action)
-
-        envs = vector_of(Own, 2)
-        envs.reset(seed=0)
-        with pytest.raises(ConfigError, match="a step of its own"):
-            envs.rollout(None, np.zeros((2, 3, 1)), offsets={"q": 1.0})
-
 
 class TestSeed:
     @pytest.mark.parametrize("way", WAYS)
@@ -253,7 +246,7 @@ def test_costs_are_no_others_that_a_class_tells(told, vector_of):
         def _get_info(self):
             return {"costs": told}
 
-    envs = vector_of(Telling, 2, hooks="per_env")
+    envs = vector_of(in_way("one by one", Telling), 2)
     envs.reset(seed=0)
     assert envs.rollout(None, np.zeros((2, 3, 1), np.float32)).costs == {}
 
@@ -265,7 +258,7 @@ def test_costs_that_are_not_told_are_zero(vector_of):
         def _get_info(self):
             return {"costs": {"push": 2.0}} if self.action > 0 and self.step_count > 2 else {}
 
-    envs = vector_of(Paying, 2, hooks="per_env")
+    envs = vector_of(in_way("one by one", Paying), 2)
     envs.reset(seed=0)
     start = envs.save_state(0)
     pushed = np.repeat([0.0, 0.0, 0.01, 0.01], 4).reshape(4, 4, 1).astype(np.float32)

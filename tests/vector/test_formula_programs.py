@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 import test_declared
-import test_declared_single
 
 import fmugym
-from fmugym import ConfigError
-from fmugym.vector.engines import programs
 from fmugym.vector.hooks.formula_programs import formulas_of
 
 SWING = {
@@ -20,21 +17,6 @@ SWING = {
 }
 
 
-def no_trace(*_, **__):
-    raise AssertionError("a hook of Python was traced")
-
-
-@test_declared_single.each_task
-def test_no_hook_is_called(task, load, make_envs, monkeypatch):
-    for name in ("trace_hooks", "sample_states", "require_same"):
-        monkeypatch.setattr(programs, name, no_trace)
-    made = load(task, hooks="compiled"), make_envs(lambda: fmugym.load(task), 3, hooks="compiled")
-    for env in made:
-        env.reset(seed=1)
-        for _ in range(3):
-            env.step(env.action_space.sample())
-
-
 def test_the_time_begins_where_it_is_drawn(load):
     """With substeps, after a warm-up: the time is that of the FMU, in programs and in Python."""
     task = SWING | {
@@ -44,8 +26,8 @@ def test_the_time_begins_where_it_is_drawn(load):
         "reward": {"now": "time", "since": "elapsed", "steps": "step"},
     }
     told = []
-    for hooks in ("compiled", "python"):
-        env = load(task, hooks=hooks)
+    for hooks in ("expressions", "Python"):
+        env = load(task, way=hooks)
         for seed in (3, None, 4):
             env.reset(seed=seed)
             for _ in range(5):
@@ -54,19 +36,6 @@ def test_the_time_begins_where_it_is_drawn(load):
                 told.append(info["reward_terms"])
     assert told[: len(told) // 2] == told[len(told) // 2 :]
     assert len({one["now"] for one in told}) == 15
-
-
-@pytest.mark.parametrize("has_stepped", [False, True])
-def test_a_function_that_is_assigned_takes_the_place_of_a_formula(load, has_stepped):
-    env = load(SWING)
-    env.reset(seed=1)
-    if has_stepped:
-        env.step(env.action_space.sample())
-    assert formulas_of(env) is not None
-    env._reward_policy = lambda: 5.0
-    assert formulas_of(env) is None
-    for _ in range(3):
-        assert env.step(env.action_space.sample())[1] == 5.0
 
 
 class Own(fmugym.TaskEnv):
@@ -88,16 +57,17 @@ def test_a_hook_of_a_class_takes_the_place_of_a_formula(opened, make_envs):
     assert rewards == pytest.approx(np.cos([one[0] for one in envs.get_attr("state")]))
 
 
-def test_a_task_that_is_too_long_for_a_program_runs_on_arrays(make_envs):
+def test_a_task_that_is_too_long_for_a_program_runs_on_arrays(make_envs, caplog):
     task = SWING | {"reward": {f"r{n}": f"sin(theta * {n}) + {n}" for n in range(3, 3500)}}
-    envs = make_envs(lambda: fmugym.load(task), 2)
+    with caplog.at_level("INFO", "fmugym"):
+        envs = make_envs(lambda: fmugym.load(task), 2)
+    assert "more than 20000 operations" in caplog.text
     envs.reset(seed=1)
     _, rewards, *_ = envs.step(envs.action_space.sample())
     number = np.arange(3, 3500)
     expected = [(np.sin(one[0] * number) + number).sum() for one in envs.get_attr("state")]
     assert rewards == pytest.approx(expected)
-    with pytest.raises(ConfigError, match="more than 20000 operations"):
-        make_envs(lambda: fmugym.load(task), 2, hooks="compiled")
+    assert envs.inside.engine.way == "arrays"
 
 
 @test_declared.each_file

@@ -1,4 +1,4 @@
-"""Compiled hooks of environments whose FMUs run in worker processes."""
+"""Hooks of environments whose FMUs run in worker processes."""
 
 import os
 import signal
@@ -13,11 +13,10 @@ from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
     CART_POLE,
     Drawing,
-    each_mode,
     require_equal,
     results_of_both,
-    run_side_by_side,
 )
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
@@ -29,10 +28,10 @@ from fmugym.pool.requests import Answer, Request, request_listing
 
 @pytest.fixture(name="make")
 def fixture_make(opened):
-    def make(cls, num_envs=5, hooks="compiled", workers=2, **options):
+    def make(cls, num_envs=5, hooks="arrays", workers=2, **options):
         if workers:
             options |= {"isolation": "process", "workers": workers}
-        envs = opened(FMUVectorEnv(cls, num_envs, hooks=hooks, **options))
+        envs = opened(FMUVectorEnv(in_way(hooks, cls), num_envs, **options))
         assert isinstance(envs.inside.pool, ProcessPool) == bool(workers)
         return envs
 
@@ -96,25 +95,9 @@ def test_results_are_those_of_one_process(make, cls, mode):
     """To the last bit, with episodes that start in every way."""
     isolated = make(cls, 70, autoreset_mode=mode)
     here = make(cls, 70, workers=None, autoreset_mode=mode)
-    assert isolated.inside.engine.way == "compiled"
     list(results_of_both(isolated, here))
     for name in ("variables", "previous_state", "action", "inputs", "step_count"):
         np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
-
-
-class Halves(Short):
-    """One hook cannot be compiled."""
-
-    def _reward_policy(self):
-        return np.partition(np.asarray(self.state), 1, axis=0)[1]
-
-
-@each_mode
-def test_one_hook_may_stay_in_python(make, mode):
-    isolated = make(Halves, hooks="auto", autoreset_mode=mode)
-    here = make(Halves, hooks="auto", workers=None, autoreset_mode=mode)
-    assert isolated.inside.engine._left
-    assert run_side_by_side(isolated, here, 40)
 
 
 def test_a_process_that_is_killed(make):
@@ -140,7 +123,7 @@ def test_a_process_that_is_killed(make):
 def test_faults_are_those_of_hooks_on_arrays(make, tmp_path):
     path = faulty_fmu(tmp_path)
     results = []
-    for hooks in ("compiled", "array"):
+    for hooks in ("arrays", "one by one"):
         envs = make(lambda: FaultyEnv(path, "crash", call_timeout=20.0), 3, hooks, workers=3)
         envs.set_attr("fault", [start_values("crash")["fault"], 0, 0])
         envs.reset(seed=0)
@@ -198,7 +181,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around, name)(actions, *more)
     with pytest.raises(ValueError, match="not prepared"):
-        around.step_one(int, None, (), 0, {})
+        around.step_one(int, None, 0)
     before = envs.inside.pool.outputs.copy()
     assert around.step_own() == 3
     nothing = _native.Access(form_of_listing(()))

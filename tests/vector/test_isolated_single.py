@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 from process_tools import linux_only, wait_until
 from test_isolated_hooks import Sampled, TwoPendulums
-from test_single_compiled import (
-    TASKS,
+from test_single_expressions import (
     require_same,
     require_same_steps,
     same,
 )
+from test_vector_tasks import Delayed, Goal, Tables, Tracking
+from ways import in_python
 
 import fmugym
-from fmugym import ConfigError
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.vector.making import make_with_pool
 
@@ -28,10 +28,9 @@ def isolated(make_env):
 
 
 def here(make_env):
-    """The same in this process, with its hooks in Python, too."""
+    """The same in this process, in Python."""
     env = make_env()
-    env.inside.way = "python"
-    return env
+    return in_python(env)
 
 
 @pytest.fixture(name="cart")
@@ -51,28 +50,18 @@ BUNDLED = [
 ]
 
 
-@pytest.mark.parametrize("cls", [*BUNDLED, *TASKS, Sampled, TwoPendulums])
+@pytest.mark.parametrize("cls", [*BUNDLED, Tracking, Delayed, Goal, Tables, Sampled, TwoPendulums])
 def test_results_are_those_of_one_process(cls):
     """With everything that hooks read."""
 
-    def make(hooks):
-        if hooks != "compiled":
-            return here(cls)
-        return cls(isolation="process") if cls in BUNDLED else isolated(cls)
-
-    require_same(make, steps=120)
-
-
-def test_hooks_cannot_be_compiled():
-    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
-    with pytest.raises(ConfigError, match="not a native one of its own"):
-        env.reset(seed=0)
-    env.close()
+    one = cls(isolation="process") if cls in BUNDLED else isolated(cls)
+    with one, here(cls) as other:
+        require_same(one, other, steps=120)
 
 
 def test_a_process_that_is_killed(cart):
     """The episode is cut short; the next ones are as without a worker."""
-    other = fmugym.envs.CartPoleEnv(hooks="python")
+    other = in_python(fmugym.envs.CartPoleEnv())
     other.reset(seed=0)
     before = other.step(0)
     os.kill(cart.inside.pool.processes()[0], signal.SIGKILL)
@@ -94,7 +83,7 @@ def test_a_worker_that_sleeps_is_woken(cart):
     def sleeps():
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
 
-    with fmugym.envs.CartPoleEnv(hooks="python") as other:
+    with in_python(fmugym.envs.CartPoleEnv()) as other:
         other.reset(seed=0)
         other.step(0)
         for _ in range(3):

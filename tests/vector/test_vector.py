@@ -16,6 +16,7 @@ from vector_tools import (
     run_side_by_side,
     sampled_actions,
 )
+from ways import make_vec
 
 from fmugym.vector import FMUVectorEnv
 
@@ -23,7 +24,7 @@ from fmugym.vector import FMUVectorEnv
 @in_each_mode({"env_id": IDS})
 def test_each_environment_is_what_it_is_alone(env_id, mode, hooks, outside):
     options = {"max_episode_steps": 25}
-    ours = gym.make_vec(env_id, num_envs=5, autoreset_mode=mode, hooks=hooks, **options)
+    ours = make_vec(hooks, env_id, num_envs=5, autoreset_mode=mode, **options)
     theirs = SyncVectorEnv([lambda: gym.make(env_id, **options)] * 5, autoreset_mode=mode)
     assert ours.single_observation_space == theirs.single_observation_space
     assert ours.observation_space == theirs.observation_space
@@ -32,7 +33,7 @@ def test_each_environment_is_what_it_is_alone(env_id, mode, hooks, outside):
     assert ours.observation_space.contains(ours.reset(seed=1)[0])
     rtol = 1e-7 if "Pendulum" in env_id else 0.0  # numpy's powers of arrays and of scalars
     assert run_side_by_side(ours, theirs, 120, rtol=rtol) >= 20
-    assert hooks != "auto" or not outside, "the pool starts all episodes"
+    assert hooks == "one by one" or not outside, "the pool starts all episodes"
 
 
 @each_mode
@@ -107,7 +108,7 @@ def test_equal_to_gymnasiums_cart_poles_over_many_episodes(mode):
 @each_way
 def test_the_seeds_can_be_read(hooks):
     """As in Gymnasium's SyncVectorEnv; after a reset without a seed they stay."""
-    envs = gym.make_vec("fmugym/CartPole-v0", num_envs=3, hooks=hooks)
+    envs = make_vec(hooks, "fmugym/CartPole-v0", num_envs=3)
     envs.reset(seed=9)
     assert envs.np_random_seed == (9, 10, 11)
     envs.reset()
@@ -115,7 +116,7 @@ def test_the_seeds_can_be_read(hooks):
     envs.reset(seed=[4, None, 6])
     assert envs.np_random_seed == (4, 10, 6)
     envs.close()
-    fresh = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks)
+    fresh = make_vec(hooks, "fmugym/CartPole-v0", num_envs=2)
     first = fresh.np_random_seed
     fresh.reset()
     assert fresh.np_random_seed == first

@@ -15,6 +15,7 @@ from vector_tools import (
     results_of_both,
     sampled_actions,
 )
+from ways import in_way, make_vec
 
 from fmugym import ConfigError
 
@@ -32,12 +33,12 @@ def test_actions_may_be_lists_and_any_integers():
 
 @each_way
 def test_actions_that_do_not_fit(hooks):
-    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks)
+    vector = make_vec(hooks, "fmugym/CartPole-v0", num_envs=2)
     vector.reset(seed=0)
     for actions in ([0], [0, 1, 1], [0, 2], [-1, 0]):
         with pytest.raises(ConfigError, match="action"):
             vector.step(np.array(actions))
-    if hooks != "per_env":
+    if hooks != "one by one":
         for actions in (1, [0.0, 1.0], [None, 1], [[0], [1]], "01", [[0, 1], 0]):
             with pytest.raises(ConfigError, match="action"):
                 vector.step(actions)
@@ -57,14 +58,14 @@ def test_a_bad_action_is_forgotten():
 
 @each_way
 def test_an_action_that_does_not_fit_changes_nothing(hooks, make_envs):
-    vector = make_envs(CART_POLE, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 3)
     first = vector.reset(seed=0)[0]
     with pytest.raises(ConfigError, match=r"environment 2.* is not in Discrete"):
         vector.step(np.array([0, 1, 7]))
     assert vector.get_attr("step_count") == (0, 0, 0)
     assert vector.get_attr("action") == (0, 0, 0)
     np.testing.assert_array_equal(np.array(vector.get_attr("state"), np.float32), first)
-    twin = make_envs(CART_POLE, 3, hooks=hooks)
+    twin = make_envs(in_way(hooks, CART_POLE), 3)
     twin.reset(seed=0)
     for actions in sampled_actions(vector, 20):
         require_equal(vector.step(actions)[0], twin.step(actions)[0])
@@ -73,7 +74,7 @@ def test_an_action_that_does_not_fit_changes_nothing(hooks, make_envs):
 @in_turn({"hooks": HOOKS, "env_id": ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"]})
 def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, hooks):
     """In the third step environment 1 starts its second episode."""
-    vector = gym.make_vec(env_id, num_envs=3, max_episode_steps=3, hooks=hooks)
+    vector = make_vec(hooks, env_id, num_envs=3, max_episode_steps=3)
     vector.reset(seed=0)
     good = np.zeros(vector.action_space.shape, vector.action_space.dtype)
     vector.step(good)
@@ -99,7 +100,7 @@ def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks, dtype, make_envs):
         def _get_inputs(self):
             return 0.0 * self.step_count
 
-    vector = make_envs(Uninterested, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, Uninterested), 2)
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1"):
         vector.step(np.array([[0.0], [np.nan]], dtype))

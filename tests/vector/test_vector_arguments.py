@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from odd_values import Unspeakable
 from vector_tools import Drawing, each_way, require_equal
+from ways import in_way
 
+import fmugym
 from fmugym import ConfigError
 from fmugym.vector import FMUVectorEnv
 
@@ -18,7 +20,7 @@ SEEDS = (
 
 @pytest.mark.parametrize("seed", SEEDS, ids=lambda seed: type(seed).__name__)
 def test_seeds_that_do_not_fit(seed, make_envs):
-    vector = make_envs(Drawing, 3, hooks="array")
+    vector = make_envs(in_way("arrays", Drawing), 3)
     with pytest.raises(ConfigError, match="seed"):
         vector.reset(seed=seed)
 
@@ -65,7 +67,7 @@ def test_options_that_are_no_dict(options, make_envs):
 
 @each_way
 def test_unknown_options_are_named(hooks, make_envs):
-    vector = make_envs(Drawing, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, Drawing), 2)
     with pytest.raises(ConfigError, match="did you mean 'model_parameters'"):
         vector.reset(options={"model_parameter": {}})
     with pytest.raises(ConfigError, match="unknown"):
@@ -113,7 +115,6 @@ BAD = (
     *(("private_libraries", value) for value in (0, 1, "yes", [True], Unspeakable())),
     *(("isolation", value) for value in (1, "proces", ["process"], np.ones(2), Unspeakable())),
     *(("max_episode_steps", value) for value in (0, 1.5, Unspeakable())),
-    *(("hooks", value) for value in (None, 1, ["array"], np.ones(2), Unspeakable())),
     *(("autoreset_mode", value) for value in (None, 1, ["next_step"], np.ones(2), Unspeakable())),
     *(("make_env", value) for value in (None, 1, "fmugym.envs:CartPoleEnv", [Drawing])),
 )
@@ -121,7 +122,7 @@ BAD = (
 
 @pytest.mark.parametrize(("name", "value"), BAD)
 def test_arguments_of_other_types(name, value, temp_root):
-    named = {"hooks": "way of calling hooks", "autoreset_mode": "autoreset mode"}.get(name, name)
+    named = {"autoreset_mode": "autoreset mode"}.get(name, name)
     with pytest.raises(ConfigError, match=named):
         FMUVectorEnv(**{"make_env": Drawing, "num_envs": 2, name: value})
     assert not list(temp_root.iterdir())
@@ -139,6 +140,13 @@ def test_unknown_arguments_are_type_errors_too():
     for error in (ConfigError, TypeError):
         with pytest.raises(error, match="'thread'; did you mean 'threads'"):
             FMUVectorEnv(Drawing, 2, thread=1)
+
+
+@pytest.mark.parametrize("make", [FMUVectorEnv, lambda cls, _, **given: cls(**given)])
+def test_the_way_of_calling_hooks_is_no_argument(make):
+    """The class says it: ``vectorized``."""
+    with pytest.raises(ConfigError, match=r"unexpected keyword argument 'hooks'; known are: "):
+        make(fmugym.envs.CartPoleEnv, 2, hooks="auto")
 
 
 @pytest.mark.parametrize("threads", [np.int64(1), 10**6])

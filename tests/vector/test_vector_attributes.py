@@ -11,56 +11,48 @@ from vector_tools import (
     results_of_both,
     run_side_by_side,
 )
+from ways import in_way
 
 from fmugym import ConfigError, Uniform
 from fmugym.vector import FMUVectorEnv
 
 
-def cart_pole_with(attributes=None, **parameters):
-    env = CART_POLE(model_parameters=parameters)
-    for name, value in (attributes or {}).items():
-        setattr(env, name, value)
-    return env
+def cart_pole_with(**parameters):
+    return CART_POLE(model_parameters=parameters)
 
 
 @each_way
 def test_attributes_for_each_environment(hooks):
     forces, limits = [5.0, 10.0, 15.0], [0.1, 2.4, 0.2]
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
+    vector = FMUVectorEnv(in_way(hooks, CART_POLE), 3)
     vector.set_attr("force_mag", forces)
     vector.set_attr("x_threshold", np.array(limits))
-    vector.set_attr("sutton_barto_reward", True)
     assert vector.get_attr("force_mag") == tuple(forces)
-    assert vector.get_attr("sutton_barto_reward") == (True,) * 3
     theirs = SyncVectorEnv(
         [
-            lambda f=force, x=limit: cart_pole_with(
-                {"force_mag": f, "x_threshold": x, "sutton_barto_reward": True}
-            )
+            lambda f=force, x=limit: cart_pole_with(force_mag=f, x_threshold=x)
             for force, limit in zip(forces, limits, strict=True)
-        ]
+        ],
+        observation_mode="different",
     )
     assert run_side_by_side(vector, theirs, 100) > 5
 
 
 @pytest.mark.parametrize("values", [[0.5, 1.5, -2.0], [1, 2, 3], [True, False, True], [2.0] * 3])
-def test_hooks_stay_compiled_with_attributes_for_each_environment(values):
-    """They ran on arrays until now. The program reads the values as it reads a parameter's."""
-
+def test_hooks_read_attributes_of_each_environment(values):
     class Weighted(Drawing):
         weight = 1.0
 
         def _reward_policy(self):
             return self.weight * self.state[0] + (self.weight > 1)
 
-    ways = [FMUVectorEnv(Weighted, 3, hooks=hooks) for hooks in ("compiled", "array")]
+    ways = [FMUVectorEnv(in_way(hooks, Weighted), 3) for hooks in ("arrays", "one by one")]
     for now in ([4.0, 5.0, 6.0], values):
         for vector in ways:
             vector.set_attr("weight", now)
         list(results_of_both(*ways, 5))
         for vector in ways:
             assert vector.get_attr("weight") == tuple(now)
-    assert [vector.inside.engine.way for vector in ways] == ["compiled", "array"]
     for vector in ways:
         vector.close()
 
@@ -69,7 +61,7 @@ def test_hooks_stay_compiled_with_attributes_for_each_environment(values):
 def test_parameters_for_each_environment(hooks, make_envs):
     """They hold from the next episode on, several at a time, and options come before them."""
     masses, frictions = [0.05, 0.1, 0.2], [0.0, 0.5, 1.0]
-    vector = make_envs(CART_POLE, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 3)
     vector.reset(seed=8)
     vector.set_attr("m_pole", masses)
     vector.set_attr("m_cart", 0.9)
@@ -91,7 +83,7 @@ def test_parameters_for_each_environment(hooks, make_envs):
 
 @each_way
 def test_parameters_that_the_config_does_not_name_or_draws(hooks):
-    vector = FMUVectorEnv(Drawing, 3, hooks=hooks)
+    vector = FMUVectorEnv(in_way(hooks, Drawing), 3)
     vector.reset(seed=0)
     vector.set_attr("b", [0.0, 1e-4, 2e-4])
     vector.set_attr("q_0", [0.1, 0.2, 0.3])
@@ -108,23 +100,21 @@ def test_parameters_that_the_config_does_not_name_or_draws(hooks):
 
 @each_way
 def test_values_that_do_not_fit(hooks, make_envs):
-    vector = make_envs(CART_POLE, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 3)
     with pytest.raises(ConfigError, match="there are 2 values of 'force_mag', expected 3"):
         vector.set_attr("force_mag", [1.0, 2.0])
     for values in (["a", 1.0, 1.0], [1.0, [2.0, 3.0], 4.0], [{}, 1.0, 2.0], [1.0, 1.0, np.nan]):
         with pytest.raises(ConfigError, match="m_pole"):
             vector.set_attr("m_pole", values)
-        if hooks != "per_env" and values[2] is not np.nan:
-            with pytest.raises(ConfigError, match="'force_mag' can hold one number"):
-                vector.set_attr("force_mag", values)
-    if hooks != "per_env":
-        with pytest.raises(ConfigError, match="one number for each environment"):
-            vector.set_attr("force_mag", np.ones((3, 2)))
+        with pytest.raises(ConfigError, match="'force_mag' takes numbers of shape"):
+            vector.set_attr("force_mag", values)
+    with pytest.raises(ConfigError, match="'force_mag' takes numbers of shape"):
+        vector.set_attr("force_mag", np.ones((3, 2)))
 
 
 @each_way
 def test_misspelt_attributes_and_parameters(hooks, make_envs):
-    vector = make_envs(CART_POLE, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 3)
     for misspelt, meant in (("force_magg", "force_mag"), ("m_poles", "m_pole")):
         with pytest.raises(ConfigError, match=f"{misspelt!r}; did you mean {meant!r}"):
             vector.set_attr(misspelt, [1.0, 2.0, 3.0])
@@ -136,7 +126,7 @@ def test_misspelt_attributes_and_parameters(hooks, make_envs):
 
 @each_way
 def test_methods_are_called_for_each_environment(hooks, make_envs):
-    vector = make_envs(CART_POLE, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 2)
     observations, _ = vector.reset(seed=0)
     read = vector.call("read_variables", "x")
     assert [np.float32(values["x"]) for values in read] == observations[:, 0].tolist()
@@ -161,9 +151,6 @@ class Limited(CART_POLE):
         self.limit = self.limit / 2
         self.step_count = 0
 
-    def mark(self, value):
-        self.marks.append(value)
-
     def name_it(self, name):
         self.name = name
 
@@ -176,7 +163,7 @@ class Limited(CART_POLE):
 
 @each_way
 def test_what_a_method_assigns_takes_effect(hooks, make_envs):
-    vector = make_envs(Limited, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, Limited), 3)
     vector.reset(seed=0)
     assert vector.step(np.zeros(3, np.int64))[2].tolist() == [False] * 3
     assert vector.call("set_limit", 0.0) == (0.0,) * 3
@@ -193,13 +180,11 @@ def test_what_a_method_assigns_takes_effect(hooks, make_envs):
 
 
 def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing(make_envs):
-    vector = make_envs(Limited, 3, hooks="array")
+    vector = make_envs(in_way("arrays", Limited), 3)
     vector.reset(seed=0)
     vector.step(np.zeros(3, np.int64))
     with pytest.raises(ConfigError, match="'step_count' cannot be set"):
         vector.call("halve_and_stop")
-    with pytest.raises(ConfigError, match=r"self\.marks in place"):
-        vector.call("mark", 1.0)
     assert vector.get_attr("limit") == (2.4,) * 3
     assert vector.get_attr("marks") == ([0.0],) * 3
     vector.call("name_it", "trolley")
@@ -208,7 +193,7 @@ def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing(m
 
 @each_way
 def test_methods_that_no_environment_can_do_alone(hooks, make_envs):
-    vector = make_envs(CART_POLE, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 2)
     vector.reset(seed=0)
     for method in ("reset", "step", "close"):
         with pytest.raises(ConfigError, match=f"{method!r} cannot be called on single"):
@@ -221,7 +206,7 @@ def test_methods_that_no_environment_can_do_alone(hooks, make_envs):
 
 @each_way
 def test_what_the_environments_keep_themselves_cannot_be_set(hooks, make_envs):
-    vector = make_envs(CART_POLE, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, CART_POLE), 2)
     for name in ("state", "time", "action_space", "inside", "step", "_is_done", "fmu"):
         with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
             vector.set_attr(name, 1.0)

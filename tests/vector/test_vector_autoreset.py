@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from vector_tools import HOOKS, Drawing, each_way, sampled_actions
+from ways import in_way
 
 from fmugym import ConfigError, SimulationError
 
@@ -16,7 +17,7 @@ def test_the_first_reset_is_of_all(make_envs):
 
 @each_way
 def test_disabled_autoreset_wants_a_reset(hooks, make_envs):
-    vector = make_envs(Drawing, 2, autoreset_mode="disabled", hooks=hooks)
+    vector = make_envs(in_way(hooks, Drawing), 2, autoreset_mode="disabled")
     vector.reset(seed=0)
     actions = sampled_actions(vector, 4)
     for action in actions[:3]:
@@ -33,10 +34,9 @@ def test_disabled_autoreset_wants_a_reset(hooks, make_envs):
 @in_turn({"own,given,expected": [(3, None, 3), (8, 4, 4), (2, 9, 2)], "hooks": HOOKS})
 def test_truncation_at_the_smaller_limit(own, given, expected, hooks, make_envs):
     vector = make_envs(
-        lambda: Drawing(max_episode_steps=own),
+        in_way(hooks, lambda: Drawing(max_episode_steps=own)),
         3,
         max_episode_steps=given,
-        hooks=hooks,
     )
     vector.reset(seed=0)
     for _ in range(3):  # episodes
@@ -49,9 +49,8 @@ def test_truncation_at_the_smaller_limit(own, given, expected, hooks, make_envs)
 def test_the_reset_step_does_not_step_the_fmu(hooks, make_env, make_envs):
     """The probe FMU counts its steps."""
     vector = make_envs(
-        lambda: make_env(model_output_names=["steps", "sum"], max_episode_steps=2),
+        in_way(hooks, lambda: make_env(model_output_names=["steps", "sum"], max_episode_steps=2)),
         2,
-        hooks=hooks,
     )
     vector.reset()
     counts, rewards = [], []

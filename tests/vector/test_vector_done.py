@@ -12,13 +12,14 @@ from vector_tools import (
     require_equal,
     results_of_both,
 )
+from ways import in_way
 
 import fmugym
 from fmugym import SimulationError
 from fmugym.series import RecordVectorSeries
 from fmugym.vector import FMUVectorEnv
 
-KINDS = ("compiled", "array")
+KINDS = "arrays"
 each_kind = pytest.mark.parametrize("hooks", KINDS)
 
 
@@ -47,7 +48,8 @@ class Raising(Faulty):
 def pair(make_envs):
     def make(task, hooks, mode, num_envs=6):
         return tuple(
-            make_envs(task, num_envs, autoreset_mode=mode, hooks=way) for way in (hooks, "per_env")
+            make_envs(in_way(way, task), num_envs, autoreset_mode=mode)
+            for way in (hooks, "one by one")
         )
 
     return make
@@ -79,13 +81,13 @@ def test_the_callers_array_is_not_done(hooks, pair):
 
 @each_kind
 def test_rollouts_leave_done_and_snapshots_have_it(hooks, make_envs):
-    envs = make_envs(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
+    envs = make_envs(in_way(hooks, CART_POLE), 4, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=0)
     while not any(done := envs.get_attr("done")):
         envs.step(np.ones(4, np.int64))
     candidate = envs.save_state(int(np.argmin(done)))
     envs.rollout(candidate, np.ones((8, 30), np.int64))
-    other = make_envs(CART_POLE, 4, hooks="per_env")
+    other = make_envs(in_way("one by one", CART_POLE), 4)
     other.restore_state(envs.save_state())
     assert envs.get_attr("done") == other.get_attr("done") == done
 
@@ -123,10 +125,10 @@ def test_costs_in_a_series_have_the_done_of_their_step(mode, hooks):
     ours, theirs = (
         RecordVectorSeries(
             FMUVectorEnv(
-                lambda: fmugym.load(TASK), 3, max_episode_steps=9, autoreset_mode=mode, hooks=way
+                in_way(way, lambda: fmugym.load(TASK)), 3, max_episode_steps=9, autoreset_mode=mode
             )
         )
-        for way in (hooks, "per_env")
+        for way in (hooks, "one by one")
     )
     list(results_of_both(ours, theirs))
     rows = [{c.name: envs.series[c.name] for c in envs.series.columns} for envs in (ours, theirs)]

@@ -23,6 +23,7 @@ from vector_tools import (
     require_equal,
     sampled_actions,
 )
+from ways import in_way
 
 from fmugym import FMUVectorEnv, SimulationError
 
@@ -83,7 +84,7 @@ TASKS = [CART_POLE, Square, Telling]
 
 
 def made(task, num_envs=NUM_ENVS):
-    envs = FMUVectorEnv(task, num_envs, autoreset_mode=SAME_STEP, hooks="compiled")
+    envs = FMUVectorEnv(in_way("arrays", task), num_envs, autoreset_mode=SAME_STEP)
     envs.reset(seed=0)
     return envs
 

@@ -20,6 +20,7 @@ from vector_tools import (
     results_of_both,
     sampled_actions,
 )
+from ways import in_way
 
 from fmugym import SimulationError
 
@@ -36,7 +37,7 @@ def require_same_reasons(first, second):
 @in_each_mode({"on_fault": ["truncate", "terminate"], "cls": [Cart, PushedCart]})
 def test_faults_are_those_of_single_environments(cls, on_fault, mode, hooks):
     logging.getLogger(f"fmugym.{cls.__name__}").setLevel(logging.CRITICAL)
-    ours, theirs = make_pair(cls, mode, hooks=hooks, on_fault=on_fault)
+    ours, theirs = make_pair(cls, mode, way=hooks, on_fault=on_fault)
     rng = np.random.default_rng(1)
     absurd = rng.random((60, 4)) < 0.1
     pushes = np.where(absurd, ABSURD, rng.uniform(-1, 1, (60, 4)))[..., None]
@@ -51,7 +52,7 @@ def test_faults_are_those_of_single_environments(cls, on_fault, mode, hooks):
 
 @in_turn({"hooks": HOOKS, "cls": [Cart, PushedCart]})
 def test_a_fault_may_be_raised(cls, hooks, make_envs):
-    vector = make_envs(lambda: cls(on_fault="raise"), 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, lambda: cls(on_fault="raise")), 3)
     vector.reset(seed=0)
     fine, absurd = ([0.5], [ABSURD]) if cls is Cart else (0, 1)
     with pytest.raises(SimulationError, match="returned Discard"):
@@ -76,7 +77,7 @@ def test_an_fmu_may_ask_for_the_end(version, hooks, probe, make_envs):
         require_same_infos(*({k: v for k, v in one.items() if "fmu" in k} for one in infos))
 
     stop = {"fault": 6, "fault_step": 3}
-    vector = make_envs(Stopping, 3, hooks="compiled" if hooks == "auto" else hooks)
+    vector = make_envs(in_way(hooks, Stopping), 3)
     for name, value in stop.items():
         vector.set_attr(name, [0, value, 0])
     theirs = SyncVectorEnv([Stopping, lambda: Stopping(**stop), Stopping])
@@ -88,7 +89,7 @@ def test_an_fmu_may_ask_for_the_end(version, hooks, probe, make_envs):
 
 @each_way
 def test_a_start_that_fails_is_an_error(hooks, make_env, make_envs):
-    vector = make_envs(make_env, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, make_env), 2)
     vector.reset()
     with pytest.raises(SimulationError, match="init"):
         vector.reset(options={"model_parameters": {"init_status": 3}})
@@ -122,8 +123,8 @@ class Rewarding(Drawing):
 @in_each_mode({"on_fault": ["truncate", "terminate"]})
 def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(on_fault, mode, hooks):
     logging.getLogger("fmugym.Rewarding").setLevel(logging.CRITICAL)
-    way = "compiled" if hooks == "auto" else hooks
-    ours, theirs = make_pair(Rewarding, mode, hooks=way, num_envs=6, on_fault=on_fault)
+    way = hooks
+    ours, theirs = make_pair(Rewarding, mode, way=way, num_envs=6, on_fault=on_fault)
     ends = [result[2] | result[3] for result in results_of_both(ours, theirs, 60)]
     assert np.sum(ends) > 20
     counts = ours.health["not_finite"]
@@ -135,7 +136,7 @@ def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(on_fau
 
 @each_way
 def test_a_number_that_is_not_finite_may_be_raised(hooks, make_envs):
-    vector = make_envs(lambda: Rewarding(on_fault="raise"), 9, hooks=hooks)
+    vector = make_envs(in_way(hooks, lambda: Rewarding(on_fault="raise")), 9)
     vector.reset(seed=1)
     actions = sampled_actions(vector, 12)
     with pytest.raises(SimulationError, match=r"environment \d: (_reward_policy returned|the obs)"):
@@ -153,7 +154,7 @@ class Overflowing(Drawing):
 @each_way
 def test_an_observation_that_overflows_is_a_fault(hooks, make_envs):
     logging.getLogger("fmugym.Overflowing").setLevel(logging.CRITICAL)
-    vector = make_envs(lambda: Overflowing(max_episode_steps=9), 5, hooks=hooks)
+    vector = make_envs(in_way(hooks, lambda: Overflowing(max_episode_steps=9)), 5)
     vector.reset(seed=1)
     faults = 0
     for actions in sampled_actions(vector, 30):
@@ -169,7 +170,7 @@ def test_a_first_observation_that_is_not_finite(hooks, make_envs):
         def _get_observation(self):
             return np.array(self.state) / (0.0 * self.step_count + 0.0)
 
-    vector = make_envs(Blind, 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, Blind), 2)
     with (
         np.errstate(all="ignore"),
         pytest.raises(SimulationError, match="the first observation"),

@@ -17,6 +17,7 @@ from vector_tools import (
     require_pair_equal,
     sampled_actions,
 )
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
@@ -26,7 +27,7 @@ from fmugym.pool.native import NativePool
 @each_way
 @each_mode
 def test_hooks_read_what_they_read_in_a_single_environment(mode, hooks):
-    ends = require_pair_equal(Remembering, mode=mode, hooks=hooks, substeps=2, warm_up=0.04)
+    ends = require_pair_equal(Remembering, mode=mode, way=hooks, substeps=2, warm_up=0.04)
     assert ends > 10
 
 
@@ -53,19 +54,19 @@ class Delegating(fmugym.envs.CartPoleEnv):
 @pytest.mark.parametrize("cls", [Imprecise, Reaching, Historic, Shifted, Delegating])
 def test_tasks(cls, hooks):
     """Of a float64, goals, several numbers in one variable, another start, and bound methods."""
-    require_pair_equal(cls, hooks=hooks)
+    require_pair_equal(cls, way=hooks)
 
 
 @each_way
 def test_the_rewards_of_goals(hooks, make_envs):
-    vector = make_envs(Reaching, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, Reaching), 3)
     vector.reset(seed=0)
     observations, rewards, *_, infos = vector.step(sampled_actions(vector, 1)[0])
     goals = observations["achieved_goal"], observations["desired_goal"]
     assert vector.call("compute_reward", *goals, infos)[0].tolist() == rewards.tolist()
 
 
-@pytest.mark.parametrize("hooks", ["array", "auto"])
+@pytest.mark.parametrize("hooks", ["arrays"])
 @pytest.mark.parametrize(
     "config",
     [
@@ -89,8 +90,7 @@ def test_types_of_inputs_and_outputs(config, hooks, probe):
             return {"inputs": np.array(self.inputs), "x": self.variables["x"]}
 
     has_array = config.get("model_output_names") != "on_out"
-    way = "compiled" if hooks == "auto" and has_array else hooks
-    require_pair_equal(Typed, steps=30, hooks=way)
+    require_pair_equal(Typed, steps=30, way=hooks if has_array else "one by one")
 
 
 def test_discrete_observations(make_env, make_envs):
@@ -118,7 +118,7 @@ MISTAKES = [
 
 @in_turn({"hook,value,error,text": MISTAKES, "hooks": HOOKS})
 def test_mistakes_in_hooks(hook, value, error, text, hooks, make_envs):
-    vector = make_envs(type("Mistaken", (Drawing,), {hook: value}), 2, hooks=hooks)
+    vector = make_envs(in_way(hooks, type("Mistaken", (Drawing,), {hook: value})), 2)
     with pytest.raises(error, match=text):
         vector.reset(seed=0), vector.step(np.zeros((2, 1), np.float32))
 
@@ -129,7 +129,7 @@ class Branching(CART_POLE):
 
 
 def test_fmus_step_together_whatever_the_hooks_are(monkeypatch, make_envs):
-    vector = make_envs(Branching, 5, hooks="per_env")
+    vector = make_envs(in_way("one by one", Branching), 5)
     vector.reset(seed=0)
     calls, step = [], NativePool.step
     monkeypatch.setattr(NativePool, "step", lambda *given: calls.append(1) or step(*given))

@@ -15,9 +15,9 @@ from vector_tools import (
     require_equal,
     sampled_actions,
 )
+from ways import in_way, make_vec, many
 
 import fmugym
-from fmugym.vector import FMUVectorEnv
 
 
 def arrays_of(value):
@@ -30,9 +30,9 @@ def arrays_of(value):
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_results_belong_to_the_caller(mode, hooks):
     """Spoiling results changes nothing, and later steps do not change results."""
-    keywords = {"autoreset_mode": mode, "hooks": hooks}
+    keywords = {"autoreset_mode": mode, "way": hooks}
     for cls in (Remembering, fmugym.envs.CartPoleEnv):
-        careful, careless = (FMUVectorEnv(cls, 3, **keywords) for _ in range(2))
+        careful, careless = (many(cls, 3, **keywords) for _ in range(2))
         kept = [careful.reset(seed=0)]
         careless.reset(seed=0)
         copies = [pickle.dumps(kept[0])]
@@ -53,7 +53,7 @@ def test_results_belong_to_the_caller(mode, hooks):
 
 @each_way
 def test_infos_as_lists(hooks):
-    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks)
+    vector = make_vec(hooks, "fmugym/CartPole-v0", num_envs=2)
     wrapped = gym.wrappers.vector.DictInfoToList(vector)
     _, infos = wrapped.reset(seed=0)
     assert [sorted(info["drawn"]) for info in infos] == [
@@ -82,7 +82,7 @@ def require_zero_outside_of_masks(infos):
 
 @in_each_mode({"cls": [Remembering, CART_POLE]})
 def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks, make_envs):
-    vector = make_envs(cls, 4, autoreset_mode=mode, hooks=hooks)
+    vector = make_envs(in_way(hooks, cls), 4, autoreset_mode=mode)
     require_zero_outside_of_masks(vector.reset(seed=0)[1])
     told = 0
     for actions in sampled_actions(vector, 40):

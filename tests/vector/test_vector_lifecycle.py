@@ -21,6 +21,7 @@ from vector_tools import (
     require_equal,
     sampled_actions,
 )
+from ways import in_way
 
 from fmugym import ConfigError, SimulationError
 from fmugym.vector import FMUVectorEnv, vectorized
@@ -43,9 +44,9 @@ COPIES = {
 MAKERS = {
     "class": lambda: FMUVectorEnv(CART_POLE, 3, autoreset_mode="same_step", max_episode_steps=9),
     "partial": lambda: FMUVectorEnv(
-        functools.partial(CART_POLE, fmi_version="3.0"), 3, hooks="array"
+        in_way("arrays", functools.partial(CART_POLE, fmi_version="3.0")), 3
     ),
-    "function": lambda: FMUVectorEnv(lambda: CART_POLE(), 3, hooks="per_env"),
+    "function": lambda: FMUVectorEnv(in_way("one by one", lambda: CART_POLE()), 3),
     "entry point": lambda: vectorized("fmugym.envs:CartPoleEnv")(3, threads=1),
     "id": lambda: gym.make_vec("fmugym/CartPole-v0", 3, max_episode_steps=7),
     "wrapped": lambda: gym.wrappers.vector.RecordEpisodeStatistics(
@@ -149,7 +150,7 @@ def test_the_mode_is_where_callers_look_for_it(mode):
 
 @each_way
 def test_calls_out_of_order(hooks):
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
+    vector = FMUVectorEnv(in_way(hooks, CART_POLE), 3)
     with pytest.raises(SimulationError, match="step was called before the first reset"):
         vector.step(np.zeros(3, np.int64))
     vector.reset(seed=0)

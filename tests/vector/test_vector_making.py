@@ -2,11 +2,11 @@
 
 import threading
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from combinations import in_turn
 from vector_tools import HOOKS, Drawing, require_equal, require_pair_equal
+from ways import in_way, make_vec
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -15,12 +15,12 @@ from fmugym.vector import FMUVectorEnv
 NOTHING = np.zeros((3, 1), np.float32)
 
 
-@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+@pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_an_environment_that_was_there_before_is_refused_and_lives_on(hooks):
     env = Drawing()
     first = env.reset(seed=1)[0]
     with pytest.raises(ConfigError, match="make_env must make a new environment in each call"):
-        FMUVectorEnv(lambda: env, 3, hooks=hooks)
+        FMUVectorEnv(in_way(hooks, lambda: env), 3)
     env.step(NOTHING[0])
     require_equal(env.reset(seed=1)[0], first)
     env.close()
@@ -34,7 +34,7 @@ def test_the_same_environment_twice_is_refused():
         return made[0]
 
     with pytest.raises(ConfigError, match="make_env must make a new environment in each call"):
-        FMUVectorEnv(make, 3, hooks="per_env")
+        FMUVectorEnv(in_way("one by one", make), 3)
 
 
 @pytest.mark.parametrize(
@@ -48,12 +48,14 @@ def test_the_same_environment_twice_is_refused():
 def test_environments_that_differ_in_more_than_values_are_refused(changes, what):
     given = iter([{}, {}, changes])
     with pytest.raises(ConfigError, match=f"environment 2 has another {what} than environment 0"):
-        FMUVectorEnv(lambda: Drawing(**next(given)), 3, hooks="per_env")
+        FMUVectorEnv(in_way("one by one", lambda: Drawing(**next(given))), 3)
 
 
 def test_they_may_differ_in_values(make_envs):
     given = iter([0.1, 0.2, 0.3])
-    vector = make_envs(lambda: Drawing(model_parameters={"q_0": next(given)}), 3, hooks="per_env")
+    vector = make_envs(
+        in_way("one by one", lambda: Drawing(model_parameters={"q_0": next(given)})), 3
+    )
     observations, _ = vector.reset(seed=1)
     np.testing.assert_allclose(observations[:, 0], [0.1, 0.2, 0.3], rtol=1e-6)
 
@@ -100,10 +102,10 @@ class UsesItself(Drawing):
 
 @in_turn({"hooks": HOOKS, "cls": [WithHelper, UsesItself]})
 def test_constructors_may_make_and_use_environments(cls, hooks):
-    require_pair_equal(cls, 12, num_envs=3, hooks=hooks)
+    require_pair_equal(cls, 12, num_envs=3, way=hooks)
 
 
-@pytest.mark.parametrize("hooks", ["array", "per_env"])
+@pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_make_env_may_use_another_thread(hooks, make_envs):
     def make():
         made = []
@@ -112,7 +114,7 @@ def test_make_env_may_use_another_thread(hooks, make_envs):
         thread.join()
         return made[0]
 
-    vector = make_envs(make, 3, hooks=hooks)
+    vector = make_envs(in_way(hooks, make), 3)
     assert vector.reset(seed=1)[0].shape == (3, 2)
     vector.step(NOTHING)
 
@@ -125,7 +127,7 @@ def test_all_are_closed(temp_root):
             closed.append(self)
             super().close()
 
-    vector = FMUVectorEnv(Closing, 3, hooks="per_env")
+    vector = FMUVectorEnv(in_way("one by one", Closing), 3)
     vector.reset(seed=1)
     vector.close()
     assert len(set(map(id, closed))) == 3
@@ -142,7 +144,7 @@ def test_what_was_made_is_closed_if_a_later_one_cannot_be_made(temp_root):
         return made[-1]
 
     with pytest.raises(KeyError, match="no more"):
-        FMUVectorEnv(make, 3, hooks="per_env")
+        FMUVectorEnv(in_way("one by one", make), 3)
     for env in made:
         with pytest.raises(SimulationError, match="closed"):
             env.reset()
@@ -158,12 +160,9 @@ class Failing(Drawing):
         return 1.0
 
 
-@in_turn({"mode": ["next_step", "same_step", "disabled"], "hooks": ["array", "per_env"]})
-def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(
-    hooks, mode, monkeypatch, make_envs
-):
-    monkeypatch.setattr("fmugym.vector.choosing.find_difference", lambda env: None)
-    vector = make_envs(Failing, 3, hooks=hooks, autoreset_mode=mode)
+@in_turn({"mode": ["next_step", "same_step", "disabled"], "hooks": ["arrays", "one by one"]})
+def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(hooks, mode, make_envs):
+    vector = make_envs(in_way(hooks, Failing), 3, autoreset_mode=mode)
     first = vector.reset(seed=1)[0]
     vector.step(NOTHING)
     with pytest.raises(ZeroDivisionError):
@@ -184,10 +183,12 @@ class FailingEarly(Drawing):
         return self.action
 
 
-@pytest.mark.parametrize("hooks", ["array", "per_env"])
+@pytest.mark.parametrize("hooks", ["arrays", "one by one"])
 def test_an_exception_before_the_step_leaves_the_episodes(hooks, make_envs):
-    vector, twin = (make_envs(FailingEarly, 3, hooks=hooks) for _ in range(2))
-    vector.reset(seed=1), twin.reset(seed=1)
+    vector, twin = (make_envs(in_way(hooks, FailingEarly), 3) for _ in range(2))
+    for envs in (vector, twin):
+        envs.reset(seed=1)
+        envs.step(NOTHING)
     with pytest.raises(ZeroDivisionError):
         vector.step(np.array([[0.0], [0.006], [0.0]], np.float32))
     require_equal(vector.step(NOTHING)[0], twin.step(NOTHING)[0])
@@ -195,7 +196,7 @@ def test_an_exception_before_the_step_leaves_the_episodes(hooks, make_envs):
 
 def test_bundled_ids_take_any_number():
     """The environments of one vector environment share the FMU that they open."""
-    envs = gym.make_vec("fmugym/Pendulum-v0", num_envs=20, hooks="per_env")
+    envs = make_vec("one by one", "fmugym/Pendulum-v0", 20)
     assert len({id(fmu) for fmu in envs.get_attr("fmu")}) == 1
     envs.close()
     assert fmugym.bundled_fmu("Pendulum").exists()

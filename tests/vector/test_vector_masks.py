@@ -12,6 +12,7 @@ import pytest
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from vector_tools import CART_POLE, Drawing, PushedCart, require_equal, require_pair_equal
+from ways import in_way
 
 from fmugym import SimulationError, Uniform
 from fmugym.vector.engines.batch import BatchEngine
@@ -107,7 +108,9 @@ def masks(rng, ended):
 @in_turn({"task": TASKS, "num_envs": [1, 5, 140]})
 def test_episodes_are_those_of_single_environments(task, num_envs):
     """Whose ends are reset by masks."""
-    options = {"num_envs": num_envs, "hooks": "auto"}
+    options = {
+        "num_envs": num_envs,
+    }
     assert require_pair_equal(task, 120, AutoresetMode.DISABLED, **options) > 3
 
 
@@ -231,7 +234,7 @@ def test_a_first_observation_that_is_not_finite(made):
 
 
 def test_a_first_observation_that_is_not_finite_in_the_step_that_ends_another_episode(make_envs):
-    envs = make_envs(Dividing, 1, hooks="compiled", autoreset_mode=AutoresetMode.SAME_STEP)
+    envs = make_envs(in_way("arrays", Dividing), 1, autoreset_mode=AutoresetMode.SAME_STEP)
     envs.reset(seed=4)  # draws more than a half for the first episode, and less for the second one
     envs.set_attr("bound", 0.5)
     with np.errstate(invalid="ignore"), pytest.raises(SimulationError, match="first observation"):

@@ -21,6 +21,7 @@ from vector_tools import (
     require_equal,
     run_side_by_side,
 )
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -49,7 +50,9 @@ class InTheBackground(gym.vector.VectorWrapper):
 
 @in_turn({"mode": list(AutoresetMode), "hooks": HOOKS})
 def test_results_are_those_of_step(mode, hooks):
-    first, second = (FMUVectorEnv(CART_POLE, 4, autoreset_mode=mode, hooks=hooks) for _ in range(2))
+    first, second = (
+        FMUVectorEnv(in_way(hooks, CART_POLE), 4, autoreset_mode=mode) for _ in range(2)
+    )
     assert run_side_by_side(InTheBackground(first), second, 40) > 4
 
 
@@ -149,7 +152,7 @@ class Waiting(Drawing):
 @pytest.fixture
 def waiting():
     Waiting.gate.set()
-    envs = FMUVectorEnv(Waiting, 2, hooks="array")
+    envs = FMUVectorEnv(in_way("arrays", Waiting), 2)
     envs.reset(seed=0)
     Waiting.gate.clear()
     yield envs

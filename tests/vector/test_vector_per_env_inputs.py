@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from vector_tools import make_pair, results_of_both
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError
@@ -56,7 +57,7 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (4, len(FORMS), 2)).astype
 @pytest.mark.parametrize("forms", [FORMS, (None,) * 6, (np.float32,) * 6, (list,) * 6])
 def test_inputs_of_any_form_are_those_of_single_environments(forms):
     """An array that all environments return must not mix their inputs."""
-    ours, theirs = make_pair(TwoTorques, num_envs=len(forms), hooks="per_env")
+    ours, theirs = make_pair(TwoTorques, num_envs=len(forms), way="one by one")
     for envs in (ours, theirs):
         envs.set_attr("form", list(forms))
     for _ in results_of_both(ours, theirs, list(ACTIONS)):
@@ -67,7 +68,7 @@ def test_inputs_of_any_form_are_those_of_single_environments(forms):
 
 @pytest.mark.parametrize("form", [None, np.float32, list])
 def test_an_input_that_is_not_finite_names_its_environment(form, make_envs):
-    envs = make_envs(TwoTorques, 3, hooks="per_env")
+    envs = make_envs(in_way("one by one", TwoTorques), 3)
     envs.reset(seed=0)
     envs.set_attr("form", form)
     envs.step(ACTIONS[0][:3])
@@ -85,7 +86,7 @@ def test_an_input_that_is_not_finite_names_its_environment(form, make_envs):
 @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
 def test_infos_are_asked_for_as_in_a_single_environment(mode):
     """The info of a fault is asked for once, in the state before the step."""
-    envs = FMUVectorEnv(TwoTorques, 3, hooks="per_env", autoreset_mode=mode)
+    envs = FMUVectorEnv(in_way("one by one", TwoTorques), 3, autoreset_mode=mode)
     alone = TwoTorques()
     envs.reset(seed=0)
     alone.reset(seed=1)

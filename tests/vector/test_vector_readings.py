@@ -5,7 +5,6 @@ no use for them, but the caller may ask for them at any time. The reference are 
 in Python.
 """
 
-from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -18,6 +17,7 @@ from vector_tools import (
     results_of_both,
     sampled_actions,
 )
+from ways import in_way
 
 COUNT, STEPS = 3, 6
 NAMES = (
@@ -28,10 +28,6 @@ NAMES = (
 
 class Told(Drawing):
     """Methods that read what no hook reads. Episodes end after some steps, one by its hook."""
-
-    def __init__(self, hooks="auto"):
-        super().__init__()
-        self._way = hooks
 
     def _is_done(self):
         return abs(self.state[0]) > 0.55
@@ -45,8 +41,8 @@ def pair(opened, make_envs):
     """Make a vector environment, and single environments in Python."""
 
     def make(hooks, mode=AutoresetMode.NEXT_STEP, cls=Told):
-        ours = make_envs(cls, COUNT, hooks=hooks, autoreset_mode=mode)
-        theirs = SyncVectorEnv([partial(cls, "python")] * COUNT, autoreset_mode=mode)
+        ours = make_envs(in_way(hooks, cls), COUNT, autoreset_mode=mode)
+        theirs = SyncVectorEnv([cls] * COUNT, autoreset_mode=mode)
         return ours, opened(theirs)
 
     return make
@@ -81,7 +77,7 @@ def test_snapshots_hold_the_last_step(count, hooks, mode, pair):
     envs = ours, theirs = pair(hooks, mode)
     list(islice(results_of_both(*envs, STEPS, seed=0), count))
     for index, told in enumerate(theirs.call("told")):
-        with Told("python") as other:
+        with Told() as other:
             other.restore_state(ours.save_state(index))
             assert plain(other.told()) == plain(told)
 
@@ -94,8 +90,8 @@ def test_pictures_show_the_last_step(hooks, pair):
     class Pictured(Told):
         metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
 
-        def __init__(self, hooks="auto"):
-            super().__init__(hooks)
+        def __init__(self):
+            super().__init__()
             self.render_mode = "rgb_array"
 
         def render(self):
@@ -121,6 +117,6 @@ def test_a_recorded_series_tells_the_state_before(hooks, pair):
 
 def test_before_the_first_reset(make_envs):
     """There is no last step: the values are those of a new environment."""
-    envs = make_envs(Told, 2)
+    envs = make_envs(Told, 2, way="arrays")
     assert plain(envs.get_attr("step_count")) == [0, 0]
     assert plain(envs.get_attr("previous_action")) == [[0.0], [0.0]]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from vector_tools import CART_POLE, Drawing, grow, protect, reshape, retype, sampled_actions
+from ways import in_way
 
 from fmugym import FMUVectorEnv
 from fmugym.task.values import UNFILLED, LateDict
@@ -43,7 +44,7 @@ MODES = ("next_step", "same_step")
 
 
 def make(task, mode="next_step"):
-    envs = FMUVectorEnv(task, NUM_ENVS, hooks="compiled", autoreset_mode=mode)
+    envs = FMUVectorEnv(in_way("arrays", task), NUM_ENVS, autoreset_mode=mode)
     envs.reset(seed=0)
     return envs
 

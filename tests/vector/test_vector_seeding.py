@@ -17,6 +17,7 @@ from vector_tools import (
     results_of_both,
     sampled_actions,
 )
+from ways import in_way
 
 from fmugym import Choice, Normal, Uniform
 from fmugym.distributions import draw, is_distribution
@@ -42,11 +43,11 @@ OPTIONS = (
 )
 
 
-@pytest.mark.parametrize("hooks", ["array", "auto"])
+@pytest.mark.parametrize("hooks", ["arrays"])
 @pytest.mark.parametrize("kind", PARAMETERS)
 def test_options_take_the_streams_back(kind, hooks):
     keywords = {"model_parameters": PARAMETERS[kind], "episode_variables": VARIABLES}
-    ours, theirs = make_pair(Drawing, hooks=hooks, **keywords)
+    ours, theirs = make_pair(Drawing, way=hooks, **keywords)
     list(results_of_both(ours, theirs, 5))
     for options in OPTIONS * 2:
         mask = np.array([True, False, True, True])
@@ -68,7 +69,7 @@ def test_options_take_the_streams_back(kind, hooks):
 def test_an_unseeded_reset_draws_from_somewhere(hooks):
     starts = []
     for _ in range(2):
-        vector = FMUVectorEnv(Drawing, 3, hooks=hooks)
+        vector = FMUVectorEnv(in_way(hooks, Drawing), 3)
         starts += vector.reset()[0][:, 0].tolist()
         vector.close()
     assert len(set(starts)) == 6
@@ -115,8 +116,8 @@ class Targets(Drawing):
 @each_way
 def test_a_distribution_for_each_element(hooks, mode):
     """Drawn, reset, told and seen as in single environments, whatever way hooks are called."""
-    way = "compiled" if hooks == "auto" else hooks
-    ours, theirs = make_pair(Targets, mode, num_envs=5, hooks=way)
+    way = hooks
+    ours, theirs = make_pair(Targets, mode, num_envs=5, way=way)
     for _ in results_of_both(ours, theirs, 20):
         variables = zip(ours.get_attr("variables"), theirs.get_attr("variables"), strict=True)
         for first, second in variables:
@@ -128,7 +129,7 @@ def test_a_distribution_for_each_element(hooks, mode):
 @in_turn({"mode": list(AutoresetMode), "hooks": HOOKS})
 def test_elements_that_only_python_can_draw(hooks, mode):
     variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
-    options = {"num_envs": 3, "hooks": hooks, "variables": variables}
+    options = {"num_envs": 3, "way": hooks, "variables": variables}
     assert require_pair_equal(Targets, 12, mode, **options) >= 6
 
 
@@ -155,7 +156,7 @@ def test_elements_are_drawn_in_the_documented_order():
 
 @each_way
 def test_options_and_arrays_with_distributions(hooks):
-    ours, theirs = make_pair(Targets, hooks=hooks)
+    ours, theirs = make_pair(Targets, way=hooks)
     options = {"model_parameters": {"b": Uniform(0.0, 1e-5)}}
     for given in (options, {}):
         require_same_starts(*(envs.reset(seed=3, options=dict(given)) for envs in (ours, theirs)))

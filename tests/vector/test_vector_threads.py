@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from test_threads import MANY, call_at_once, interrupt, run_together
 from vector_tools import results_of_both
+from ways import in_way, many
 
 from fmugym import SimulationError
 from fmugym.envs import CartPoleEnv
@@ -17,10 +18,9 @@ ACTIONS = np.zeros(3, np.int64)
 
 
 OPTIONS = [
-    {"hooks": "compiled"},
-    {"hooks": "compiled", "autoreset_mode": "SAME_STEP"},
-    {"hooks": "array"},
-    {"hooks": "per_env"},
+    {"way": "arrays", "autoreset_mode": "SAME_STEP"},
+    {"way": "arrays"},
+    {"way": "one by one"},
     {"isolation": "process", "workers": 2},
 ]
 
@@ -48,7 +48,7 @@ def calls_of(envs, snapshot):
 
 @pytest.mark.parametrize("options", OPTIONS)
 def test_threads_at_once_leave_it_whole(options):
-    envs = FMUVectorEnv(CartPoleEnv, 3, **options)
+    envs = many(CartPoleEnv, 3, **options)
     envs.reset(seed=0)
     call_at_once(calls_of(envs, envs.save_state()))
     require_whole(envs)
@@ -57,7 +57,7 @@ def test_threads_at_once_leave_it_whole(options):
 @pytest.mark.parametrize("options", OPTIONS)
 def test_a_thread_may_close_it_meanwhile(options):
     for _ in range(5):
-        envs = FMUVectorEnv(CartPoleEnv, 3, **options)
+        envs = many(CartPoleEnv, 3, **options)
         envs.reset(seed=0)
         calls = calls_of(envs, envs.save_state())
         closer = threading.Timer(0.01, envs.close)
@@ -80,9 +80,9 @@ def require_whole(envs):
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
-@pytest.mark.parametrize("hooks", ["compiled", "array"])
+@pytest.mark.parametrize("hooks", ["arrays"])
 def test_interrupts_leave_it_whole(hooks):
-    envs = FMUVectorEnv(CartPoleEnv, 3, hooks=hooks)
+    envs = FMUVectorEnv(in_way(hooks, CartPoleEnv), 3)
     envs.reset(seed=0)
     calls = [
         lambda: envs.get_attr("state"),

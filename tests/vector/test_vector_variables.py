@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode
-from test_single_compiled import require_same, with_hooks
 from vector_tools import Drawing, require_equal, require_pair_equal, sampled_actions
+from ways import in_way
 
 import fmugym
 from fmugym import Uniform
-from fmugym.vector import FMUVectorEnv
+from fmugym.task.step import ORDER
+from fmugym.testing import check_hooks
 
 
 class Summing(Drawing):
@@ -29,25 +30,31 @@ class Summing(Drawing):
         return self.variables["sum"] + self.variables["left"] * self.variables["count"]
 
 
-def test_sums_in_place_are_compiled():
+def test_sums_in_place():
     """``+=`` changes an array in place, where a number is replaced."""
     for mode in AutoresetMode:
-        assert require_pair_equal(Summing, steps=20, mode=mode, hooks="compiled") > 5
+        assert require_pair_equal(Summing, steps=20, mode=mode, way="arrays") > 5
 
 
-class Aliasing(Summing):
-    """Keeps what a sum was: on arrays, it changes with the sum."""
+class Swapping(Drawing):
+    """Assigns arrays that the environment keeps itself, and parts of them."""
+
+    def __init__(self):
+        super().__init__(episode_variables={"one": 0.5, "other": 0.0, "pair": [1.0, 2.0]})
 
     def _update(self):
-        before = self.variables["sum"]
-        self.variables["sum"] += self.state[0]
-        self.variables["left"] = self.variables["sum"] - before
+        one, other, pair = self.variables["one"], self.variables["other"], self.variables["pair"]
+        self.variables["one"], self.variables["other"] = other, one + self.state[0]
+        self.variables["pair"] = np.stack([pair[1], one + 0.0 * pair[0]])
+
+    def _reward_policy(self):
+        pair = self.variables["pair"]
+        return self.variables["one"] + 10 * self.variables["other"] + 100 * pair[0] - pair[1]
 
 
-def test_a_sum_in_place_that_is_still_read_is_not_taken_for_its_old_value():
-    assert require_pair_equal(Aliasing, hooks="auto") > 5
-    with pytest.raises(fmugym.ConfigError, match="_update"):
-        FMUVectorEnv(Aliasing, 2, hooks="array")
+def test_variables_may_be_swapped():
+    for mode in AutoresetMode:
+        assert require_pair_equal(Swapping, steps=20, mode=mode, way="arrays") > 5
 
 
 class Changing(Drawing):
@@ -75,10 +82,10 @@ class Changing(Drawing):
         return np.stack([0.0 * self.state[0] + part for part in parts])
 
 
-@in_turn({"mode": list(AutoresetMode), "hooks": ["compiled", "array"]})
+@in_turn({"mode": list(AutoresetMode), "hooks": ["arrays"]})
 def test_each_episode_starts_with_the_whole_value(mode, hooks):
     """The first episode and later ones, while others have other types."""
-    assert require_pair_equal(Changing, steps=20, mode=mode, hooks=hooks) > 5
+    assert require_pair_equal(Changing, steps=20, mode=mode, way=hooks) > 5
 
 
 def writing(hook):
@@ -102,25 +109,13 @@ def writing(hook):
     return Writing
 
 
-HOOKS = ("_get_inputs", "_is_done", "_is_truncated", "_reward_policy", "_get_observation")
-
-
-@pytest.mark.parametrize("hook", [*HOOKS, "_get_info"])
+@pytest.mark.parametrize("hook", [one for one in ORDER if one != "_update"])
 def test_what_another_hook_than_update_writes_is_kept(hook):
     """Only ``_update`` may do so. Where another hook does, no way of calling it may lose that."""
-    assert require_pair_equal(writing(hook), hooks="auto", steps=20) > 5
+    assert require_pair_equal(writing(hook), way="one by one", steps=20) > 5
     if hook != "_get_inputs":
-        with pytest.raises(fmugym.ConfigError, match=hook):
-            FMUVectorEnv(writing(hook), 2, hooks="array")
-
-
-@pytest.mark.parametrize("hook", HOOKS)
-def test_hooks_that_write_variables_are_not_compiled(hook):
-    with pytest.raises(fmugym.ConfigError, match="_update"):
-        FMUVectorEnv(writing(hook), 2, hooks="compiled")
-    env = with_hooks(writing(hook), "compiled")
-    with env, pytest.raises(fmugym.ConfigError, match="variable"):
-        env.reset(seed=1)
+        with pytest.raises(fmugym.ContractError, match=f"{hook} changes self.variables"):
+            check_hooks(writing(hook))
 
 
 class Queueing(Drawing):
@@ -149,11 +144,8 @@ class Queueing(Drawing):
         return np.sum(self.variables["queue"], axis=0) - self.variables["bits"] + whole / (1 + rest)
 
 
-def test_a_variable_that_is_an_index_is_compiled_in_one_environment():
-    """In random states it is outside of its table; hooks in Python would raise there, too."""
-    compiled, ended = require_same(lambda hooks: with_hooks(Queueing, hooks), steps=60)
-    assert compiled > 30
-    assert ended > 5
+def test_a_variable_may_be_an_index():
+    assert require_pair_equal(Queueing, way="arrays", steps=30) > 5
 
 
 class Mixed(Drawing):
@@ -171,7 +163,7 @@ class Mixed(Drawing):
 
 
 def test_before_the_first_action_in_parts_are_zeros():
-    assert require_pair_equal(Mixed, hooks="auto", steps=8) > 0
+    assert require_pair_equal(Mixed, way="one by one", steps=8) > 0
     with Mixed() as env:
         env.reset(seed=1)
         assert env.step(env.action_space.sample())[1] == 0.0
@@ -184,11 +176,10 @@ class Adding(Summing):
         self.variables["sum"] = self.variables["sum"] + self.state[0]
 
 
-def test_sums_go_on_when_steps_are_compiled_again(make_envs):
-    """While one episode has parameters of its own, all steps are done on arrays."""
+def test_sums_go_on_while_an_episode_has_parameters_of_its_own(make_envs):
     ours, theirs = (
-        make_envs(lambda: Adding(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks)
-        for hooks in ("compiled", "per_env")
+        make_envs(in_way(hooks, lambda: Adding(max_episode_steps=50)), 3, autoreset_mode="Disabled")
+        for hooks in ("arrays", "one by one")
     )
     first = np.array([True, False, False])
     overriding = {"reset_mask": first, "model_parameters": {"m": 0.06}}
@@ -198,23 +189,3 @@ def test_sums_go_on_when_steps_are_compiled_again(make_envs):
         for actions in sampled_actions(ours, 4):
             for mine, other in zip(ours.step(actions)[:4], theirs.step(actions)[:4], strict=True):
                 require_equal(mine, other)
-
-
-class Scaling(Drawing):
-    """The first step reads a start value that later values have no type for."""
-
-    def __init__(self):
-        super().__init__(episode_variables={"last": 0.1, "scaled": 0.0}, max_episode_steps=5)
-
-    def _update(self):
-        self.variables["scaled"] = np.float64(3.0 * self.variables["last"])
-        self.variables["last"] = np.float32(0.5) * self.action[0]
-
-    def _reward_policy(self):
-        return self.variables["scaled"]
-
-
-def test_the_first_step_of_one_environment_reads_the_whole_start_value():
-    compiled, ended = require_same(lambda hooks: with_hooks(Scaling, hooks), steps=40)
-    assert compiled > 20
-    assert ended > 5

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from vector_tools import Drawing, each_way, sampled_actions
+from ways import make_vec
 
 from fmugym import SimulationError, Uniform
 
@@ -23,11 +24,11 @@ def test_statistics_of_partial_resets():
 
 @each_way
 def test_pictures_of_all(hooks):
-    vector = gym.make_vec(
+    vector = make_vec(
+        hooks,
         "fmugym/ModelicaCartPole-v0",
         num_envs=3,
         render_mode="rgb_array",
-        hooks=hooks,
         theta_0=Uniform(1.4, 1.7),
     )
     with pytest.raises(SimulationError, match="before the first reset"):

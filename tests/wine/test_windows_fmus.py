@@ -17,6 +17,7 @@ import pytest
 from fmu_tools import edited_fmu, read_fmu, write_fmu
 from process_tools import FaultyEnv, faulty_fmu, start_values, wait_until
 from vector_tools import require_same_alone
+from ways import in_way
 from wine_tools import exchange_fmu, for_windows
 
 import fmugym
@@ -317,7 +318,7 @@ class TestInWine:
     def test_compiled_hooks_tell_of_a_death(self, faulty, opened):
         envs = opened(
             fmugym.FMUVectorEnv(
-                lambda: FaultyEnv(faulty, "crash", call_timeout=30.0), 2, hooks="compiled"
+                in_way("arrays", lambda: FaultyEnv(faulty, "crash", call_timeout=30.0)), 2
             )
         )
         envs.reset(seed=0)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import sys
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from traceback import walk_tb
 from types import MappingProxyType, MethodType
 from typing import Any
 
@@ -34,7 +34,7 @@ from fmugym.task.hooks import Hooks
 from fmugym.task.native_draws import no_draws
 from fmugym.task.readings import Readings, environments_last, reading
 from fmugym.task.snapshot import Columns
-from fmugym.task.step import ORDER, conclude_left
+from fmugym.task.step import ORDER, conclude
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import array_of, checked_actions
 from fmugym.vector.calls import MethodCalls
@@ -42,7 +42,6 @@ from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult, failed_in
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.task_programs import TaskPrograms
@@ -60,9 +59,10 @@ from fmugym.vector.views import batched, column, some, take
 
 __all__ = ["BatchEngine"]
 
-logger = logging.getLogger(__name__)
-
 _BOOL = np.dtype(np.bool_)
+
+_ON_ARRAYS = (*ORDER, "_goal_reward")
+"""The hooks that are called on arrays."""
 
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
@@ -71,15 +71,15 @@ _REFUSALS = (TypeError, ValueError, BufferError)
 class BatchEngine(Engine):
     """Turns a prototype into N environments; from then on, its hooks read arrays.
 
-    The pool does a step in one call, programs included. Python calls the hooks that have no program
-    before or after it, once for all environments. The pool also starts episodes by itself, unless
-    there is something to do that only Python can: see ``_settle_starts``.
+    The pool does a step in one call, programs included. Where there are none of hooks, Python calls
+    each hook before or after it, once for all environments. The pool also starts episodes by
+    itself, unless there is something to do that only Python can: see ``_settle_starts``.
 
     Args:
         env: The prototype, made with a pool of N instances.
         num_envs: N.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
-        task: From ``find_programs``.
+        task: Its programs, or those that stand for none.
     """
 
     def __init__(
@@ -93,13 +93,14 @@ class BatchEngine(Engine):
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
         self._idle: MaskArray | None = None
         self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
+        self._variable_starts: dict[str, FloatArray] = {}
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
         self._strings = env.fmu.description.strings
         self._make_parameters(env.inside.draws)
-        self._memory = Memory(env, env.inside.readings, self.ended, self._columns)
+        self._memory = Memory(env, env.inside.readings, self.ended)
         self._prepare(task)
         self._note_foreign(slice(None), False)
 
@@ -108,7 +109,6 @@ class BatchEngine(Engine):
         self._parameters = ParameterValues(
             zip(draws.parameter_names, self._start_values, strict=True)
         )
-        self._known = set(self._parameters)
         self._texts = {name: self._with_own(texts) for name, texts in draws.strings.items()}
         shown = ShownParameters(self._parameters, self._texts)
         self.env.parameters = MappingProxyType(shown if self._strings else self._parameters)
@@ -122,9 +122,8 @@ class BatchEngine(Engine):
         env, memory = self.env, self._memory
         draws, native = env.inside.draws, env.inside.draws.native
         drawn = () if native is None else draws.drawn
-        self._task, self._left = task, task.left
-        self._left_after = {hook for hook in task.left if hook != "_get_inputs"}
-        self.way = "compiled" if task.is_compiled else "array"
+        self._task, self._calls_hooks = task, not task.is_compiled
+        self.way = "expressions" if task.is_compiled else "arrays"
         memory.parameters = self._parameters
         memory.hold(task)
         self._layout = layout = Layout(task, env, self._n)
@@ -136,9 +135,12 @@ class BatchEngine(Engine):
             self._limit,
             (StepResult, *layout.form, layout.shapes, late_info(draws)),
         )
-        has_all_starts = native is not None and task.variables.keys() == env.variables.keys()
+        starts, rows = env.config.episode_variables, memory.variables
+        fit = all(np.shape(start) == rows[n].shape[:-1] for n, start in starts.items())
+        has_all_starts = native is not None and fit
         is_free = env.inside.warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
+        self._are_hooks_tried = False
         self._settle_starts()
 
     def _settle_starts(self) -> None:
@@ -147,8 +149,15 @@ class BatchEngine(Engine):
         Python does so where others step the FMUs, where it has to draw values or to set episode
         variables, where something goes with resets, and where constants are not the usual ones.
         """
-        self._pool_starts = self._may_start and not self._any_foreign
-        self._starts_at_ends = self._pool_starts and not self._left_after
+        is_usual = not self._any_foreign and not self._variable_starts
+        self._pool_starts = self._may_start and is_usual
+        self._starts_at_ends = self._pool_starts and not self._calls_hooks
+
+    def set_variable(self, name: str, values: FloatArray) -> None:
+        """See ``Engine.set_variable``."""
+        self._place({name: values}, slice(None))
+        self._variable_starts[name] = values
+        self._settle_starts()
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
@@ -215,19 +224,6 @@ class BatchEngine(Engine):
             self._columns.pop(name, None)
             if is_row:
                 self._columns[name] = value
-        self._compile_again()
-
-    def _compile_again(self) -> None:
-        """Make other programs: they contain what attributes were, and know some parameters only."""
-        if not self._task.is_compiled:
-            return
-        task = TaskPrograms.without_programs(self.env)
-        try:
-            task = compile_hooks(self.env, [Readings.of(self.env)], self._columns)
-        except Exception as reason:  # as in find_programs
-            logger.info("the hooks cannot be compiled any more: %s", reason)
-        finally:
-            self._prepare(task)
 
     def call(
         self,
@@ -277,9 +273,6 @@ class BatchEngine(Engine):
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
         self._settle_starts()
-        if self._parameters.keys() != self._known:
-            self._known = set(self._parameters)
-            self._compile_again()
 
     # Episodes.
 
@@ -298,7 +291,7 @@ class BatchEngine(Engine):
         drawn = self._streams.draw(draws, indices)
         self._begin(indices, draws, drawn)
         try:
-            observations, infos = self._seen_at_start(None, {}, mask, ORDER)
+            observations, infos = self._seen_at_start(None, mask)
         finally:
             self.note_starts(mask)
         return observations, infos | drawn_info(draws, drawn, mask.copy())
@@ -315,26 +308,35 @@ class BatchEngine(Engine):
         if done is None:
             return None
         result, troubled, self.any_ended = done
-        if not troubled and not self._left_after:
+        if not troubled and not self._calls_hooks:
             return result
         observations, infos = result
         mask, self.has_moved = infos["_drawn"], True
         if troubled:
             require_started(self._pool, np.flatnonzero(mask))
-        return self._seen_at_start(observations, infos, mask, self._left)
+        if self._calls_hooks:
+            made = observations if self.env.inside.pool_observes else None
+            observations, more = self._seen_at_start(made, mask)
+            return observations, more | infos
+        self._require_finite_start(observations, mask)
+        return result
 
-    def _seen_at_start(
-        self, observations: Any, infos: dict[str, Any], mask: MaskArray, hooks: Container[str]
-    ) -> tuple[Any, dict[str, Any]]:
-        """Let hooks tell what is seen where episodes have started; refuse impossible starts."""
+    def _seen_at_start(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos where episodes have started; refuse impossible starts.
+
+        Args:
+            observations: Those that the pool has made; None for those of the hook.
+            mask: Where episodes have started.
+        """
         self.env.inside.in_hooks = True
         try:
-            if "_get_observation" in hooks:
+            if observations is None:
                 observations = self._observe()
             self._require_finite_start(observations, mask)
-            if "_get_info" in hooks:
-                infos = self._infos(mask) | infos
-            return observations, infos
+            return observations, self._infos(mask)
+        except Exception as error:
+            self._blame_arrays(error)
+            raise
         finally:
             self.env.inside.in_hooks = False
 
@@ -362,6 +364,8 @@ class BatchEngine(Engine):
         """Write the values of episodes into the rows of the parameters and variables."""
         constants = draws.constant_parameters
         self._place(draws.variable_starts | constants | draws.named(drawn), indices)
+        for name, values in self._variable_starts.items():
+            self._place({name: values[..., indices]}, indices)
         own = constants.keys() - draws.told.keys()
         self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
         for name, numbers in self._numbers_of_told_texts(draws, drawn).items():
@@ -472,7 +476,7 @@ class BatchEngine(Engine):
         """See ``Engine.observe``."""
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
-        return self._seen_at_start(None, {}, mask, ("_get_observation",))[0]
+        return self._seen_at_start(None, mask)[0]
 
     # Steps.
 
@@ -483,7 +487,7 @@ class BatchEngine(Engine):
         if resting is not None:
             return self._step_around(actions, resting)
         in_python = resetting is not None and not self._pool_starts
-        if self._left or in_python:
+        if self._calls_hooks or in_python:
             actions = self._checked_before(actions, resetting)
         at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
@@ -498,7 +502,7 @@ class BatchEngine(Engine):
             return self.step(self._converted(actions, error), resetting)
         result: StepResult
         result, troubled, self.any_ended, started = played
-        if troubled or self._left_after:
+        if troubled or self._calls_hooks:
             return self._completed(result, troubled, started)
         return result
 
@@ -513,17 +517,17 @@ class BatchEngine(Engine):
         self.add_offsets(self._pool, resting)
         result: StepResult
         result, troubled, *_ = play.after(checked)
-        if troubled or self._left_after:
+        if troubled or self._calls_hooks:
             result = self._completed(result, troubled, resting)
         self.ended |= resting
         self.any_ended = True
         return result
 
     def _checked_before(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
-        """Check actions before anything is drawn, and call ``_get_inputs`` if it has no program."""
+        """Check actions before anything is drawn, and call ``_get_inputs`` unless programs do."""
         self.has_moved = False
         checked = self._flat(actions)
-        if "_get_inputs" in self._left:
+        if self._calls_hooks:
             self._call_get_inputs(checked, resetting)
         return checked
 
@@ -570,7 +574,7 @@ class BatchEngine(Engine):
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
-        if self._left or not self._pool.rolls_out:
+        if self._calls_hooks or not self._pool.rolls_out:
             return None
         shape = len(actions), self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
@@ -581,7 +585,7 @@ class BatchEngine(Engine):
             return None
         return observations, *judged, costs_in(infos, shape)
 
-    # Hooks without a program.
+    # Hooks on arrays.
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -591,6 +595,10 @@ class BatchEngine(Engine):
         read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
             self._write_inputs(self._pool.inputs, resetting)
+            self._keep_variables()
+        except Exception as error:
+            self._blame_arrays(error)
+            raise
         finally:
             env.inside.in_hooks = False
             read.action, read.previous_action, read.previous_state = before
@@ -621,41 +629,66 @@ class BatchEngine(Engine):
     def _completed(
         self, result: StepResult, troubled: int, started: MaskArray | None
     ) -> StepResult:
-        """Call the hooks that are not compiled, and handle faults."""
-        if self._left_after:
-            result = self._with_hooks_left(result, troubled, started)
+        """Call the hooks if programs have not done their work, and handle faults."""
+        if self._calls_hooks:
+            result = self._concluded(result, troubled, started)
         rewards, observations = not_finite(result.rewards), not_finite(result.observations)
         if troubled or rewards is not None or observations is not None:
             self._mend(result, started, (rewards, observations))
         return result
 
-    def _with_hooks_left(
+    def _concluded(
         self, result: StepResult, troubled: int, started: MaskArray | None
     ) -> StepResult:
-        """Call the hooks that are not compiled, in their order."""
-        env, left = self.env, self._left
+        """Call the hooks that follow the FMUs' step."""
+        env, inside = self.env, self.env.inside
         self._idle = failed_in(self._pool.statuses) if troubled else None
         if started is not None:
             self._idle = started if self._idle is None else self._idle | started
-        env.inside.in_hooks = True
+        observed = result.observations if inside.pool_observes else None
+        inside.in_hooks = True
         try:
-            concluded = conclude_left(env, self, left, result[:-1])
-            observations, rewards, terminated, truncated = concluded
-            if "_get_observation" in left:
-                space = env.observation_space
-                observations = hook_results.observations(observations, space, self._n)
+            stopped = result.terminated if troubled else False
+            seen, rewards, terminated, truncated = conclude(
+                env, self, stopped, result.truncated, observed
+            )
+            if observed is None:
+                seen = hook_results.observations(seen, env.observation_space, self._n)
             infos = result.infos
-            if "_get_info" in left:
+            if inside.has_info:
                 infos = self._infos(np.ones(self._n, _BOOL)) | infos
+            self._keep_variables()
+            self._are_hooks_tried = True
+        except Exception as error:
+            self._blame_arrays(error)
+            raise
         finally:
-            env.inside.in_hooks = False
+            inside.in_hooks = False
         if started is not None:
             terminated[started] = truncated[started] = False
             rewards[started] = 0.0
-        if "_is_done" in left:
-            self._memory.keep_done(terminated)
+        self._memory.keep_done(terminated)
         self.note_ends(terminated, truncated)
-        return StepResult(observations, rewards, terminated, truncated, infos)
+        return StepResult(seen, rewards, terminated, truncated, infos)
+
+    def _blame_arrays(self, error: Exception) -> None:
+        """Say which hook has not worked on arrays, until all have done so in a first step.
+
+        Raises:
+            ConfigError: If a hook has raised the error, or returned what cannot be used.
+        """
+        frames = (frame.f_code.co_name for frame, _ in walk_tb(error.__traceback__))
+        hook = next((name for name in frames if name in _ON_ARRAYS), None)
+        if isinstance(error, ConfigError):
+            hook = next((name for name in _ON_ARRAYS if str(error).startswith(f"{name} ")), None)
+        if hook is None or self._are_hooks_tried or isinstance(error, SimulationError):
+            return
+        what = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(
+            f"{hook} of {type(self.env).__name__}, whose hooks are said to be vectorized, does "
+            f"not work on the arrays of {self._n} environments: {what}. "
+            "fmugym.testing.check_hooks shows what is wrong"
+        ) from error
 
     # The form of what hooks return.
 
@@ -674,27 +707,44 @@ class BatchEngine(Engine):
         return hook_results.rewards(value, self._n)
 
     def update(self, env: Hooks) -> None:
-        """Call the hook, but keep the variables of environments that did not step.
-
-        Values that it assigns are copied, because the next step may overwrite their array.
-        """
-        variables = env.variables
-        before = {name: self._row(name) for name in variables}
-        self._memory.before = {name: row.copy() for name, row in before.items()}
+        """Call the hook, but keep the variables of environments that did not step."""
         env._update()
-        for name, row in before.items():
-            if variables[name] is not row:
-                variables[name] = self._kept_variable(name, variables[name])
+        self._keep_variables()
         if self._idle is not None and self._idle.any():
             self._restore_variables(self._idle)
 
-    def _kept_variable(self, name: str, value: Any) -> npt.NDArray[Any]:
-        row = hook_results.variable(name, value, self._n)
-        if row.dtype == np.float64:
-            return row
-        return row.astype(
-            hook_results.type_of_variable(self.env.inside.draws, name, row.dtype), copy=False
-        )
+    def _keep_variables(self) -> None:
+        """Copy what hooks have assigned to the arrays that the pool keeps, or make others."""
+        variables, held = self.env.variables, self._memory.variables
+        assigned = [name for name, row in held.items() if variables[name] is not row]
+        if not assigned:
+            return
+        values = {name: self._value_of(name, variables[name]) for name in assigned}
+        for name, value in values.items():
+            row = held[name]
+            if value.dtype == row.dtype and value.shape == row.shape:
+                row[...] = value
+                values[name] = row
+        variables.update(values)
+        others = {n: v.dtype for n, v in values.items() if v is not held[n]}
+        if others:
+            before = dict(self._memory.before)
+            self._prepare(replace(self._task, variables={**self._task.variables, **others}))
+            self._memory.take_back(before)
+
+    def _value_of(self, name: str, value: Any) -> npt.NDArray[Any]:
+        """A value of a variable as an array of its own, in the type that it is kept in."""
+        row = self._memory.variables[name]
+        if type(value) is np.ndarray and value.dtype == row.dtype and value.shape == row.shape:
+            return value if value.base is None and not self._holds(value) else value.copy()
+        array = hook_results.variable(name, value, self._n)
+        if array.dtype == np.float64:
+            return array
+        dtype = hook_results.type_of_variable(self.env.inside.draws, name, array.dtype)
+        return array.astype(dtype, copy=False)
+
+    def _holds(self, value: npt.NDArray[Any]) -> bool:
+        return any(value is row for row in self._memory.variables.values())
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._memory.before.items():

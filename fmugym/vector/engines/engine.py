@@ -40,7 +40,8 @@ class Engine(ABC):
     """Drives N environments; the caller decides when an ended one starts again.
 
     Attributes:
-        way: The way of calling hooks, see ``FMUVectorEnv``.
+        way: How hooks are called: ``"expressions"`` (not at all: programs do their work),
+            ``"arrays"`` or ``"one by one"``.
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
         has_moved: Whether the last step or reset got as far as the FMUs.
@@ -170,6 +171,20 @@ class Engine(ABC):
 
         Raises:
             ConfigError: If environments of this engine cannot have these values.
+        """
+
+    @property
+    def has_expressions_only(self) -> bool:
+        """Whether programs of expressions do what hooks would."""
+        return self.way == "expressions"
+
+    @abstractmethod
+    def set_variable(self, name: str, values: FloatArray) -> None:
+        """Give an episode variable one value for each environment, now and at each start.
+
+        Args:
+            name: The variable.
+            values: Environments last.
         """
 
     @abstractmethod

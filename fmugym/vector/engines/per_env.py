@@ -20,7 +20,7 @@ from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.actions import take_action
-from fmugym.task.construction import draws_of, prepare_hooks
+from fmugym.task.construction import draws_of, draws_of_reset, prepare_hooks
 from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
@@ -30,6 +30,7 @@ from fmugym.vector.action_arrays import checked_actions, is_array_space
 from fmugym.vector.codec import gathered, mapped
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult
+from fmugym.vector.views import take
 
 __all__ = ["PerEnvEngine"]
 
@@ -37,7 +38,7 @@ __all__ = ["PerEnvEngine"]
 class PerEnvEngine(Engine):
     """Calls the hooks of N environments, each on a column of one pool.
 
-    The FMUs still step together on all threads, unless the class has its own ``step``.
+    The FMUs still step together on all threads.
 
     Args:
         envs: The environments.
@@ -46,7 +47,7 @@ class PerEnvEngine(Engine):
         action_space: The space of the actions of all environments.
     """
 
-    way = "per_env"
+    way = "one by one"
 
     def __init__(
         self,
@@ -60,9 +61,8 @@ class PerEnvEngine(Engine):
         self._columns = [PoolColumn(pool, index) for index in range(len(envs))]
         for env, column in zip(envs, self._columns, strict=True):
             env.inside.use(column)
-            prepare_hooks(env)  # its constructor may have set some as attributes
-        self._together = not any(env.inside.own.step for env in envs)
-        self._checks_all = self._together and is_array_space(envs[0].action_space)
+            prepare_hooks(env)  # its constructor may have changed the spaces
+        self._checks_all = is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
         self._observations: list[Any] = [None] * len(envs)
@@ -103,6 +103,12 @@ class PerEnvEngine(Engine):
         for index, value in values.items():
             setattr(self._envs[index], name, value)
 
+    def set_variable(self, name: str, values: FloatArray) -> None:
+        """See ``Engine.set_variable``."""
+        for index, env in enumerate(self._envs):
+            env.variables[name] = env.inside.variable_starts[name] = take(values, index)
+            env.inside.draws = draws_of(env)
+
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         for index, env in enumerate(self._envs):
@@ -115,6 +121,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.reset``."""
         infos: dict[int, dict[str, Any]] = {}
         self.has_moved = False
+        draws_of_reset(self._envs[0], options, "reset_mask")  # it refuses unknown options
         for index in np.flatnonzero(mask).tolist():
             seed = None if seeds is None else seeds[index]
             observation, infos[index] = self._reset(index, seed, options)
@@ -130,15 +137,14 @@ class PerEnvEngine(Engine):
         items, idle = self._actions(actions), resetting if resting is None else resting
         idles = [False] * len(items) if idle is None else idle.tolist()
         try:
-            if self._together:
-                self._take_actions(items, [*compress(range(len(items)), map(not_, idles))])
-                self._pool.step(None, idle, self._pool.observations)
-                if self.offsets is not None:
-                    self.add_offsets(self._pool, idle)
-                    observed = self._pool.observations
-                    observed[:] = self._pool.outputs[: observed.shape[1]].T
+            self._take_actions(items, [*compress(range(len(items)), map(not_, idles))])
+            self._pool.step(None, idle, self._pool.observations)
+            if self.offsets is not None:
+                self.add_offsets(self._pool, idle)
+                observed = self._pool.observations
+                observed[:] = self._pool.outputs[: observed.shape[1]].T
             self.has_moved = True
-            result = self._result(self._results(items, idles, starts=resting is None))
+            result = self._result(self._results(idles, starts=resting is None))
         except BaseException:
             for env in self._envs:
                 env.inside.in_hooks = False
@@ -151,7 +157,7 @@ class PerEnvEngine(Engine):
             self.any_ended = True
         return result
 
-    def _results(self, items: Sequence[Any], idle: Sequence[bool], *, starts: bool) -> list[Result]:
+    def _results(self, idle: Sequence[bool], *, starts: bool) -> list[Result]:
         """Let the environments conclude the step one after another, start an episode, or rest."""
         results: list[Result] = []
         statuses, columns = self._pool.statuses.tolist(), self._pool.outputs.T.tolist()
@@ -163,11 +169,9 @@ class PerEnvEngine(Engine):
                 elif is_idle:
                     observation, info = self._reset(index, None, {})
                     result = observation, 0.0, False, False, info
-                elif self._together:
-                    result = _concluded(env, statuses[index], tuple(columns[index]))
                 else:
-                    result = env.step(items[index])
-                is_new = env.inside.pool_observes and self._together
+                    result = _concluded(env, statuses[index], tuple(columns[index]))
+                is_new = env.inside.pool_observes
                 self._observations[index] = result[0] if is_new else _copied(result[0])
                 results.append(result)
         except FMUGymError as error:
@@ -265,10 +269,6 @@ class PerEnvEngine(Engine):
         self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
     ) -> Iterator[None]:
         """See ``Engine.assuming``."""
-        if offsets is not None and not self._together:
-            raise ConfigError(
-                f"{type(self._envs[0]).__name__} has a step of its own, which offsets do not reach"
-            )
         self.offsets = offsets
         try:
             with assumed((env.inside.future for env in self._envs), tables):

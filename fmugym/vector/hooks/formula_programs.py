@@ -51,7 +51,7 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
     letter_of(np.dtype(env.action_space.dtype))
     judgement, seen, updated = _Judgement(env, formulas).made()
     types = dict.fromkeys(env.variables, _DOUBLE)
-    return TaskPrograms(_inputs(env, formulas), judgement, seen, types, updated, {})
+    return TaskPrograms(_inputs(env, formulas), judgement, seen, types, updated)
 
 
 def _inputs(env: FMUEnv, formulas: Formulas) -> Program:

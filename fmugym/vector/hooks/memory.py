@@ -30,7 +30,6 @@ class Memory:
         env: An environment, for what all have in common.
         readings: What the hooks of all read; its arrays become those that steps keep.
         ended: Which episodes have ended, shape (N,).
-        attributes: Attributes that have one number for each environment, by name.
 
     Attributes:
         ended: As given.
@@ -41,14 +40,8 @@ class Memory:
         before: The same before the step.
     """
 
-    def __init__(
-        self,
-        env: FMUEnv,
-        readings: Readings,
-        ended: MaskArray,
-        attributes: Mapping[str, npt.NDArray[Any]],
-    ) -> None:
-        self._env, self._readings, self._attributes = env, readings, attributes
+    def __init__(self, env: FMUEnv, readings: Readings, ended: MaskArray) -> None:
+        self._env, self._readings = env, readings
         self._n = len(ended)
         self.ended, self.parameters = ended, readings.parameters
         self.kept, self._done = np.zeros_like(readings.values), np.zeros(self._n, np.bool_)
@@ -64,6 +57,12 @@ class Memory:
             self.variables[name] = np.ascontiguousarray(row, dtype).copy()
             self.before[name] = self.variables[name].copy()
         self.show()
+
+    def take_back(self, before: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Keep what the variables were before the step, in other types and shapes than now."""
+        every = np.ones(self._n, np.bool_)
+        for name, values in before.items():
+            hook_results.restore_variable(name, self.before[name], every, values)
 
     def show(self) -> None:
         """Let hooks on arrays read what the pool keeps."""
@@ -132,10 +131,12 @@ class Memory:
                 return self.parameters[name]
             case "step_count":
                 return self._readings.step_count
-            case "attribute":
-                return self._attributes[name]
         arrays = self.variables if kind == "variable" else self.before
         return arrays[name].reshape(-1, self._n)[index]
+
+    def _elements(self, name: str, start: Any) -> npt.NDArray[Any]:
+        """The start value of each element of a variable."""
+        return np.broadcast_to(start, self.variables[name].shape[:-1]).reshape(-1)
 
     def _action_group(self) -> dict[str, Any]:
         """How the pool checks and keeps actions."""
@@ -192,7 +193,7 @@ class Memory:
                 (row, np.array(value, row.dtype).tobytes())
                 for name, start in constants.items()
                 if name in flat
-                for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
+                for row, value in zip(flat[name], self._elements(name, start), strict=True)
             ),
             "results": results,
         }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,12 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.env import FMUEnv
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.lowering import compile_graph
 from fmugym.expressions.program import Program
 from fmugym.expressions.value import Value, where
-from fmugym.task.step import ORDER
 
 __all__ = ["SeenArray", "TaskPrograms", "to_input_type"]
 
@@ -46,10 +44,7 @@ class TaskPrograms:
         seen: The arrays that the second program stores.
         variables: The types of the episode variables by name.
         updated: The names of the variables that ``_update`` writes.
-        left: The hooks that cannot be traced, and why. They run on arrays; no other hook needs
-            what they return.
-        tolerance: How far results may differ from those of hooks on arrays, relative to the largest
-            one: 0 if there are no functions of the C library and no products of matrices.
+        is_compiled: Whether they compute what the hooks do; otherwise Python calls these.
     """
 
     inputs: Program
@@ -57,34 +52,26 @@ class TaskPrograms:
     seen: tuple[SeenArray, ...]
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
-    left: Mapping[str, str]
-    tolerance: float = 0.0
+    is_compiled: bool = True
 
     @classmethod
-    def without_programs(cls, env: FMUEnv) -> TaskPrograms:
-        """A task whose hooks all run on arrays; a program only passes on that an FMU stops."""
-        inside, graph, flag = env.inside, Graph(), np.dtype(np.bool_)
-        idle = {
-            "_update": not inside.own.update,
-            "_is_truncated": not inside.own.is_truncated,
-            "_get_observation": inside.pool_observes,
-            "_get_info": not inside.has_info,
-        }
+    def without_programs(cls, variables: Iterable[str]) -> TaskPrograms:
+        """A task whose hooks run on arrays; a program only passes on that an FMU stops.
+
+        Args:
+            variables: The names of the episode variables, which are float64 at first.
+        """
+        graph, flag = Graph(), np.dtype(np.bool_)
         stopped = graph.load("stopped", None, flag, None)
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
         judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
-        left = {hook: "" for hook in ORDER if not idle.get(hook, False)}
-        return cls(compile_graph(Graph(), [], [], 0), judgement, (), {}, (), left)
+        types = dict.fromkeys(variables, np.dtype(np.float64))
+        return cls(compile_graph(Graph(), [], [], 0), judgement, (), types, (), is_compiled=False)
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TaskPrograms:
         """The same task with other tables, by the bytes of those whose place they take."""
         inputs, judgement = (one.with_tables(tables) for one in (self.inputs, self.judgement))
         return replace(self, inputs=inputs, judgement=judgement)
-
-    @property
-    def is_compiled(self) -> bool:
-        """Whether there are programs of hooks."""
-        return "_is_done" not in self.left
 
 
 def to_input_type(variable: Variable, value: Value) -> Value:

@@ -20,12 +20,12 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.expressions.graph import Cell, Graph
 from fmugym.expressions.lowering import Store, compile_graph
-from fmugym.expressions.program import TYPES, Program, UntraceableError
+from fmugym.expressions.program import Program, UntraceableError
 from fmugym.expressions.value import Value
-from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.vector.contents import Contents, borrowed
+from fmugym.task.readings import READINGS
+from fmugym.vector.contents import Contents
 from fmugym.vector.hooks.hook_results import type_of_variable
-from fmugym.vector.hooks.patches import exclusive, numpy_of
+from fmugym.vector.hooks.patches import numpy_of
 from fmugym.vector.hooks.symbolic import symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
@@ -38,44 +38,16 @@ from fmugym.vector.hooks.symbols import (
     same_for_all,
     spread,
 )
-from fmugym.vector.hooks.tables import Table, is_table, tables_in
-from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
+from fmugym.vector.hooks.tables import Table, is_table
+from fmugym.vector.hooks.task_programs import SeenArray, to_input_type
 
-__all__ = [
-    "Tracer",
-    "trace_hooks",
-]
+__all__ = ["Tracer"]
 
 
 _Made = TypeVar("_Made")
 
 _Seen = tuple[tuple[str, ...], npt.NDArray[Any], np.dtype[Any]]
 """The path and the type of a ``SeenArray``, and the nodes of the values in it."""
-
-
-def trace_hooks(
-    env: FMUEnv,
-    attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
-    refused: Mapping[str, str] = MappingProxyType({}),
-) -> TaskPrograms:
-    """Trace the hooks of an environment.
-
-    Args:
-        env: A prototype whose actions make an array.
-        attributes: Those that have one number for each environment, by name.
-        refused: Hooks that are not to be traced, and why.
-
-    Raises:
-        UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
-            program cannot do; the text names the hook, the line and what it does.
-    """
-    if env.inside.pool_tells:
-        raise UntraceableError("the pool tells infos of its own")
-    if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
-        raise UntraceableError(f"its actions are {env.action_space.dtype}")
-    with exclusive, borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
-        tracer = Tracer(env, attributes, refused)
-        return tracer.settle(tracer.task)
 
 
 class Tracer:
@@ -114,24 +86,6 @@ class Tracer:
             if self._variables == before:
                 return made
         raise UntraceableError("_update gives a variable another type in each step")
-
-    def task(self) -> TaskPrograms:
-        """Trace all hooks."""
-        self._left = {}
-        inputs = self._trace_inputs()
-        tolerance = self._graph.tolerance
-        self._begin(judging=True)
-        stores, updated = self._trace_update()
-        done: Any = self._call("_is_done", self._flags) | self._told("stopped")
-        self._env.done = done
-        truncated = self._or_left("_is_truncated", self._flags, np.False_)
-        rewards = self._or_left("_reward_policy", self._rewards, np.float64(0.0))
-        self._env.done = done & self._told("active")  # an episode starts elsewhere
-        seen, more = self._trace_seen()
-        results = [int(same_for_all(one)) for one in (done, truncated, rewards)]
-        judgement = compile_graph(self._graph, stores + more, results, len(seen))
-        parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
-        return TaskPrograms(*parts, max(tolerance, self._graph.tolerance))
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()

@@ -12,6 +12,7 @@ import pytest
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import run_side_by_side
+from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, FMI2CSEnv, FMUVectorEnv, SimulationError
@@ -468,13 +469,7 @@ class TestVector:
         del gym.registry["test/Rig-v0"]
 
 
-def test_hooks_of_a_single_real_plant_are_not_compiled():
-    env = fmugym.envs.CartPoleEnv(hooks="compiled", backend=Oscillator())
-    with env, pytest.raises(ConfigError, match="the pool is not a native one"):
-        env.reset()
-
-
-@in_turn({"hooks": ["compiled", "array", "per_env"], "mode": list(AutoresetMode)})
+@in_turn({"hooks": ["arrays", "one by one"], "mode": list(AutoresetMode)})
 def test_hooks_of_several_real_plants(hooks, mode):
     """Programs run around the steps of the rigs; each way gives what single environments do."""
     config = {"model_parameters": {"q_0": fmugym.Uniform(0.5, 2.0)}, "max_episode_steps": 7}
@@ -482,7 +477,9 @@ def test_hooks_of_several_real_plants(hooks, mode):
     def made_at_once(count):
         return (Held(as_list=True) for _ in range(count))
 
-    ours = FMUVectorEnv(lambda: RigEnv(made_at_once, **config), 3, hooks=hooks, autoreset_mode=mode)
+    ours = FMUVectorEnv(
+        in_way(hooks, lambda: RigEnv(made_at_once, **config)), 3, autoreset_mode=mode
+    )
     assert ours.inside.engine.way == hooks
     theirs = SyncVectorEnv([lambda: RigEnv(Oscillator(), **config)] * 3, autoreset_mode=mode)
     assert run_side_by_side(ours, theirs, 40) > 9
@@ -551,11 +548,11 @@ class TestPacing:
         env.close()
         stamped.close()
 
-    @pytest.mark.parametrize("hooks", ["array", "per_env"])
+    @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_info_of_several(self, hooks, make_envs):
         clock = ManualClock()
         rigs = Paced([Oscillator(), Oscillator()], clock)
-        env = make_envs(lambda: RigEnv(rigs), 2, hooks=hooks)
+        env = make_envs(in_way(hooks, lambda: RigEnv(rigs)), 2)
         env.reset()
         clock.advance(0.5)
         *_, infos = env.step(np.zeros((2, 1), np.float32))
