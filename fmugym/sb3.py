@@ -22,6 +22,7 @@ from fmugym.pool.base import MaskArray
 from fmugym.scaling import scaled_space, unscaled
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
+from fmugym.vector.infos import observation_of
 from fmugym.vector.libraries import make_vector_env, require_vector_env
 from fmugym.vector.vector_env import require_open
 
@@ -179,7 +180,7 @@ class FMUVecEnv(VecEnv):
         others = list(listed)
         for index in np.flatnonzero(dones).tolist():
             listed[index]["TimeLimit.truncated"] = bool(cut_short[index])
-            listed[index]["terminal_observation"] = last[index]
+            listed[index]["terminal_observation"] = observation_of(last, index)
             others[index] = self.reset_infos[index] = {}
         handed_out(infos, others)
 

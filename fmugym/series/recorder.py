@@ -339,8 +339,7 @@ class RecordVectorSeries(VectorWrapper):
         seen = observations
         if isinstance(observations, np.ndarray):
             seen = observations.copy()
-            for index in np.flatnonzero(ended).tolist():
-                seen[index] = infos["final_obs"][index]
+            seen[ended] = infos["final_obs"][ended]
         last = Infos(infos, self.num_envs, infos["final_info"], ended)
         return {"infos": last, "observations": seen, "last": self._at_end}
 

@@ -79,13 +79,15 @@ import logging
 from typing import Any
 
 {import_}import fmugym
-from fmugym.testing import check_fmu_env
+from fmugym.testing import check_fmu_env, check_hooks
 
 FMU_PATH = {path}  # a relative path is relative to this file
 
 
 class {name}(fmugym.{base}):
     """TODO: what is there to learn?"""
+
+    vectorized = True  # the hooks work on arrays, environments last; check_hooks looks after that
 
     def __init__(self, log_level: int = logging.WARNING) -> None:
         config = {{
@@ -108,6 +110,7 @@ if __name__ == "__main__":
     env = {name}()
     check_fmu_env(env)
     env.close()
+    check_hooks({name})
     print("{name} keeps the contract of an environment.")
 '''
 

@@ -38,6 +38,8 @@ from fmugym.tools.response import advise_episodes
 from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.choosing import hook_of_one, no_arrays
+from fmugym.vector.hooks.check import CURE, find_difference, own_hooks
 
 __all__ = ["validate"]
 
@@ -230,6 +232,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield from _of_observations(env, first, second, misread)
     yield _of_length(env)
     yield from _of_controllers(env)
+    yield from _of_hooks(env)
     yield _of_export(env)
 
 
@@ -596,6 +599,25 @@ def _bind(env: FMUEnv, given: Any) -> None:
         controller.bind(env)
     elif isinstance(warm := getattr(controller_of(given), "warm", None), Controller):
         warm.bind(env)
+
+
+def _of_hooks(env: FMUEnv) -> Iterator[Finding]:
+    """Tell whether the hooks of a class work on arrays, and whether the class says so."""
+    own = env.inside.own
+    if own.step or own.reset or not own_hooks(env):
+        return
+    difference, hook = no_arrays(env) or find_difference(env), hook_of_one(type(env))
+    if difference is None and hook is None:
+        yield Finding("ok", "hooks", "they give on arrays what they give one by one")
+    elif difference is None:
+        text = f"{hook} works on arrays, but its class does not say so"
+        yield Finding("warning", "hooks", text, "write vectorized = True in the class")
+    elif hook is None:
+        cure = f"{CURE}; or take vectorized = True out of the class"
+        yield Finding("error", "hooks", difference, cure)
+    else:
+        text = f"a vector environment calls them one by one: {difference}"
+        yield Finding("warning", "hooks", text, f"{CURE}, and vectorized = True")
 
 
 def _of_export(env: FMUEnv) -> Finding:

@@ -14,7 +14,7 @@ from fmugym.errors import ConfigError
 from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
 
-__all__ = ["TOGETHER", "MethodCalls", "attribute", "require_settable"]
+__all__ = ["TOGETHER", "MethodCalls", "attribute", "require_settable", "take_back"]
 
 TOGETHER: Final = frozenset({"close", "reset", "step"})
 """Methods that one environment cannot do alone."""
@@ -51,6 +51,14 @@ def attribute(env: FMUEnv, name: str) -> Any:
         return getattr(env, name)
     except AttributeError as error:
         raise UnknownAttributeError(str(error)) from None
+
+
+def take_back(env: FMUEnv, before: Mapping[str, Any]) -> None:
+    """Give an environment the attributes that it had before."""
+    now = vars(env)
+    for name in [name for name in now if name not in before]:
+        del now[name]
+    now.update(before)
 
 
 class MethodCalls:
@@ -102,6 +110,5 @@ class MethodCalls:
                 if variables[variable] is not number:
                     self.variables.setdefault(variable, {})[index] = number
         finally:
-            vars(env).clear()
-            vars(env).update(before)
+            take_back(env, before)
         return returned

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 from math import isfinite
+from operator import getitem
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import EpisodeDraws
@@ -20,11 +22,11 @@ __all__ = [
     "copy_rows",
     "drawn_info",
     "final_infos",
+    "last_observations",
     "late_info",
     "merged",
     "not_finite",
     "observation_of",
-    "observations_of",
     "restricted",
 ]
 
@@ -58,9 +60,7 @@ def _of_each(value: Any, count: int, kind: Any) -> Any:
     return environments_first(value) if is_drawn else np.full(count, value, kind)
 
 
-def final_infos(
-    observations: npt.NDArray[Any], infos: Mapping[str, Any], ended: MaskArray
-) -> dict[str, Any]:
+def final_infos(observations: Any, infos: Mapping[str, Any], ended: MaskArray) -> dict[str, Any]:
     """The infos of the mode ``SAME_STEP`` on the episodes that have ended."""
     return {
         "final_obs": observations,
@@ -130,9 +130,29 @@ def observation_of(observations: Any, index: int) -> Any:
     return mapped(lambda values: values[index].copy(), observations)
 
 
-def observations_of(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:
-    """An array of objects: the observations of the environments in the mask, None for others."""
-    objects = np.full(len(mask), None, dtype=object)
-    for index in np.flatnonzero(mask).tolist():
-        objects[index] = observation_of(observations, index)
-    return objects
+def last_observations(space: spaces.Space[Any], observations: Any, mask: MaskArray) -> Any:
+    """The observations of the environments in a mask, in the form of ``final_obs``.
+
+    Args:
+        space: That of one environment.
+        observations: Those of all.
+        mask: The environments, shape (N,).
+
+    Returns:
+        A new array of the same shape and type, in which floats of other environments are NaN; a
+        dict of such arrays for a ``Dict``; an array of objects, None for others, for what makes no
+        arrays, such as a ``Tuple``.
+    """
+    if isinstance(space, spaces.Dict):
+        parts = space.spaces.items()
+        return {name: last_observations(part, observations[name], mask) for name, part in parts}
+    if not isinstance(observations, np.ndarray):
+        objects = np.full(len(mask), None, dtype=object)
+        for index in np.flatnonzero(mask).tolist():
+            is_tuple = isinstance(space, spaces.Tuple)
+            objects[index] = (observation_of if is_tuple else getitem)(observations, index)
+        return objects
+    is_float = observations.dtype.kind == "f"
+    last = np.full_like(observations, np.nan) if is_float else np.zeros_like(observations)
+    last[mask] = observations[mask]
+    return last

@@ -31,7 +31,7 @@ from fmugym.vector.attributes import Attributes
 from fmugym.vector.choosing import make_engine, require_own_order
 from fmugym.vector.engines.engine import StepResult
 from fmugym.vector.episodes import Episodes
-from fmugym.vector.infos import final_infos, merged, observations_of, restricted
+from fmugym.vector.infos import final_infos, last_observations, merged, restricted
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
 from fmugym.vector.rollouts import (
@@ -68,8 +68,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         num_envs: N.
         max_episode_steps: Truncates episodes; ``gymnasium.make_vec`` passes the spec's.
         autoreset_mode: What follows the end of an episode: ``NEXT_STEP`` (the next step starts an
-            episode instead), ``SAME_STEP`` (the same step does; the last observation and info are
-            ``infos["final_obs"]`` and ``["final_info"]``) or ``DISABLED`` (``reset`` with
+            episode instead), ``SAME_STEP`` (the same step does; the last observations and infos are
+            ``infos["final_obs"]``, in the form of observations, and ``infos["final_info"]``, where
+            ``infos["_final_obs"]`` is true) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
         pool_options: Wishes of ``fmugym.pool.wishes.Wishes``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
@@ -330,7 +331,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Start the next episodes in the step that ended some, where the engine has not."""
-        last = observations_of(result.observations, ended)
+        last = last_observations(self.single_observation_space, result.observations, ended)
         observations, infos = self.inside.engine.reset(ended, None, {})
         infos |= final_infos(last, restricted(result.infos, ended), ended)
         infos = merged(restricted(result.infos, ~ended), infos)

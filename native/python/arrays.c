@@ -1,5 +1,6 @@
 #include "arrays.h"
 
+#include <math.h>
 #include <string.h>
 
 /* What is built with the headers of numpy 2 also runs with numpy 1.26. */
@@ -65,10 +66,6 @@ bool maker_take(Maker *maker, PyObject *arguments) {
     return taken;
 }
 
-bool maker_take_part(Maker *maker, const Maker *whole, int axes) {
-    return take(maker, whole->type, whole->dimensions - axes, whole->shape + axes);
-}
-
 void maker_drop(Maker *maker) {
     for (size_t k = 0; k < ROUNDS; k++) {
         Py_CLEAR(maker->made[k].array);
@@ -124,6 +121,27 @@ PyObject *maker_make(const Maker *maker, char **memory) {
         *memory = PyArray_BYTES(array);
     }
     return (PyObject *)array;
+}
+
+PyObject *maker_make_blank(const Maker *maker, char **memory) {
+    PyObject *array = maker_make(maker, memory);
+    const int type = array == NULL ? NPY_BOOL : PyArray_TYPE((PyArrayObject *)array);
+
+    if (array == NULL) {
+        return NULL;
+    }
+    if (type == NPY_DOUBLE) {
+        for (size_t i = 0; i < maker->size / sizeof(double); i++) {
+            ((double *)(void *)*memory)[i] = NAN;
+        }
+    } else if (type == NPY_FLOAT) {
+        for (size_t i = 0; i < maker->size / sizeof(float); i++) {
+            ((float *)(void *)*memory)[i] = NAN;
+        }
+    } else {
+        memset(*memory, 0, maker->size);
+    }
+    return array;
 }
 
 PyObject *maker_provide(Maker *maker, char **memory) {

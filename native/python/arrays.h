@@ -32,8 +32,6 @@ bool numpy_import(void);
 /* Takes the arguments of numpy.empty, a tuple. Returns false with an exception if they do not fit.
  * The maker must be cleared before, and be dropped in any case. */
 bool maker_take(Maker *maker, PyObject *arguments);
-/* The same for arrays like those of another maker, or like those in it, without its first axes. */
-bool maker_take_part(Maker *maker, const Maker *whole, int axes);
 void maker_drop(Maker *maker);
 
 /* A function of the module: copies arrays of one or two dimensions, whose rows have no gaps, into others
@@ -43,6 +41,8 @@ PyObject *py_copy_arrays(PyObject *module, PyObject *args);
 /* Makes an array that the maker keeps no reference of. Returns NULL with an exception if memory runs
  * out. */
 PyObject *maker_make(const Maker *maker, char **memory);
+/* The same for an array of NaN, or of zeros if it holds no floats. */
+PyObject *maker_make_blank(const Maker *maker, char **memory);
 /* Provides an array: a new one, or an earlier one that only the maker still holds. Returns NULL with
  * an exception if memory runs out. */
 PyObject *maker_provide(Maker *maker, char **memory);

@@ -15,6 +15,17 @@ PyObject *infos_mask(const Origin *origin) {
     return mask;
 }
 
+/* Copies the rows of the environments in the mask. */
+static void copy_rows(const Origin *origin, size_t number, char *memory) {
+    const size_t count = origin->mask_maker->size, size = origin->makers[number].size / count;
+    const char *const end = origin->mask + count;
+
+    for (const char *at = origin->mask; (at = memchr(at, 1, (size_t)(end - at))) != NULL; at++) {
+        const size_t place = (size_t)(at - origin->mask) * size;
+        memcpy(memory + place, origin->memory[number] + place, size);
+    }
+}
+
 static PyObject *value_of(const Origin *origin, size_t number) {
     const Maker *maker = &origin->makers[number];
     char *memory;
@@ -26,13 +37,8 @@ static PyObject *value_of(const Origin *origin, size_t number) {
     if (value == NULL) {
         return NULL;
     }
-    const size_t count = origin->mask_maker->size, size = maker->size / count;
-    const char *const end = origin->mask + count;
     memset(memory, 0, maker->size);
-    for (const char *at = origin->mask; (at = memchr(at, 1, (size_t)(end - at))) != NULL; at++) {
-        const size_t place = (size_t)(at - origin->mask) * size;
-        memcpy(memory + place, origin->memory[number] + place, size);
-    }
+    copy_rows(origin, number, memory);
     return value;
 }
 
@@ -56,4 +62,24 @@ bool infos_add(const Origin *origin, const Form *form, PyObject *dict) {
         }
     }
     return true;
+}
+
+PyObject *infos_observations(const Origin *origin, const Form *form) {
+    char *memory;
+
+    if (form->is_array) {
+        PyObject *array = maker_make_blank(&origin->makers[form->array], &memory);
+        if (array != NULL) {
+            copy_rows(origin, form->array, memory);
+        }
+        return array;
+    }
+    PyObject *dict = PyDict_New();
+    for (size_t i = 0; i < form->count && dict != NULL; i++) {
+        const Form *item = &form->items[i];
+        if (!set_item(dict, item->name, infos_observations(origin, item))) {
+            Py_CLEAR(dict);
+        }
+    }
+    return dict;
 }

@@ -19,6 +19,10 @@ typedef struct {
  * an exception if memory runs out. */
 bool infos_add(const Origin *origin, const Form *form, PyObject *dict);
 
+/* Returns new arrays in the form of observations: those of the environments in the mask. Floats of others
+ * are NaN. Returns NULL with an exception if memory runs out. */
+PyObject *infos_observations(const Origin *origin, const Form *form);
+
 /* Returns a copy of the mask, or NULL with an exception if memory runs out. */
 PyObject *infos_mask(const Origin *origin);
 

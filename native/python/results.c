@@ -3,7 +3,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "ends.h"
 #include "infos.h"
 
 struct Results {
@@ -14,7 +13,6 @@ struct Results {
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
     Form observations, infos;
-    Observed *observed;
 };
 
 enum { DRAWN, MASK_OF_DRAWN, FINAL_OBS, MASK_OF_FINAL_OBS, FINAL_INFO, MASK_OF_FINAL_INFO, NAMES };
@@ -78,19 +76,13 @@ static bool take_class(Results *r) {
     return true;
 }
 
-static bool take_ends(Results *r) {
-    r->observed = observed_take(r->last, r->number_of_seen, r->makers[MASK_ARRAY].size,
-                                &r->observations);
-    return r->observed != NULL;
-}
-
 static bool take_parts(Results *r, PyObject *parts) {
     PyObject *observations, *infos, *shapes;
 
     return PyArg_ParseTuple(parts, "O!OOO!(OOO);results", &PyType_Type, &r->class, &observations,
                             &infos, &PyTuple_Type, &shapes, &r->late, &r->unfilled, &r->tell) &&
            know_names() && take_class(r) && numpy_import() && take_makers(r, shapes) &&
-           take_forms(r, observations, infos) && take_ends(r);
+           take_forms(r, observations, infos);
 }
 
 Results *results_take(PyObject *parts) {
@@ -114,7 +106,6 @@ void results_free(Results *r) {
     if (r == NULL) {
         return;
     }
-    observed_free(r->observed);
     form_drop(&r->observations);
     form_drop(&r->infos);
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
@@ -239,8 +230,7 @@ static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
 
     origin.memory = a->last_memory;
     origin.mask = mask;
-    PyObject *observed = observed_of(r->observed, mask, a->last, a->last_memory);
-    return set_item(infos, names[FINAL_OBS], observed) &&
+    return set_item(infos, names[FINAL_OBS], infos_observations(&origin, &r->observations)) &&
            set_item(infos, names[MASK_OF_FINAL_OBS], infos_mask(&origin)) &&
            set_item(infos, names[FINAL_INFO], infos_within(&origin, &r->infos)) &&
            set_item(infos, names[MASK_OF_FINAL_INFO], infos_mask(&origin));

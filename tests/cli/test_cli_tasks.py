@@ -173,7 +173,7 @@ class TestValidate:
         for target in targets:
             out = ran("validate", target)
             assert "hooks in a vector environment: " in out
-            assert "one by one" not in out
+            assert "vector environment: one by one" not in out
             assert ("length: an episode takes at most 500 steps" in out) is (target == targets[1])
 
 

@@ -1,6 +1,6 @@
-"""What compiled steps tell of ends in the mode ``SAME_STEP``: as Gymnasium's ``SyncVectorEnv``.
+"""What steps tell of ends in the mode ``SAME_STEP``: as Gymnasium's ``SyncVectorEnv``.
 
-Arrays that nobody holds are used again, so these tests hold, change and drop what they are told.
+The last observations are in one array of the observations' shape and type.
 """
 
 import contextlib
@@ -14,9 +14,10 @@ import tracemalloc
 import gymnasium as gym
 import numpy as np
 import pytest
-import test_vector_results
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
+from test_single_expressions import PENDULUM
 from vector_tools import (
     CART_POLE,
     Drawing,
@@ -25,6 +26,7 @@ from vector_tools import (
 )
 from ways import in_way
 
+import fmugym
 from fmugym import FMUVectorEnv, SimulationError
 
 try:
@@ -49,10 +51,6 @@ class Shaped(Drawing):
 
     def _array(self):
         return np.array([self.state[0], self.state[1]], np.float32)
-
-
-class Named(Shaped, test_vector_results.Named):
-    """A dict of arrays."""
 
 
 class Square(Shaped):
@@ -80,11 +78,34 @@ class Telling(Shaped):
         return {"angle": self.state[0], "nested": {"speed": self.state[1]}}
 
 
-TASKS = [CART_POLE, Square, Telling]
+class Pair(Shaped):
+    """What makes no array: a tuple."""
+
+    def _get_observation_space(self):
+        return gym.spaces.Tuple([BOX, gym.spaces.Discrete(2)])
+
+    def _get_observation(self):
+        return self._array(), np.int64(self.state[0] > 0.2)
+
+
+def of_expressions():
+    """A task whose programs store observations and infos."""
+    return fmugym.load(PENDULUM)
+
+
+def of_outputs():
+    """A task whose observations the pool itself makes."""
+    return fmugym.load({**PENDULUM, "costs": {}, "agent": OUTPUTS})
+
+
+OUTPUTS = {"actions": ["tau"], "observations": ["q", "q_dot"]}
+TASKS = [CART_POLE, Square, Telling, of_expressions, of_outputs]
+COMPILED = [of_expressions, of_outputs]
 
 
 def made(task, num_envs=NUM_ENVS):
-    envs = FMUVectorEnv(in_way("arrays", task), num_envs, autoreset_mode=SAME_STEP)
+    way = "expressions" if task in COMPILED else "one by one" if task is Pair else "arrays"
+    envs = FMUVectorEnv(in_way(way, task), num_envs, autoreset_mode=SAME_STEP)
     envs.reset(seed=0)
     return envs
 
@@ -106,14 +127,25 @@ def require_same_form(mine, theirs):
         if isinstance(other, dict):
             assert isinstance(value, dict)
             require_same_form(value, other)
-        elif other.dtype == object:
-            assert (value.dtype, value.shape) == (other.dtype, other.shape)
-            for a, b in zip(value, other, strict=True):
-                assert type(a) is type(b)
-                if b is not None:
-                    require_equal(a, b)
         else:
             require_equal(value, other)
+
+
+def require_last(last, objects, mask, space):
+    """Arrays like observations that hold what Gymnasium has in an array of objects."""
+    if isinstance(space, gym.spaces.Dict):
+        assert list(last) == list(space)
+        for name, part in space.items():
+            rows = [None if one is None else one[name] for one in objects]
+            require_last(last[name], rows, mask, part)
+        return
+    assert type(last) is np.ndarray
+    assert (last.dtype, last.shape) == (space.dtype, (len(mask), *space.shape))
+    for row, one, has_ended in zip(last, objects, mask, strict=True):
+        if has_ended:
+            require_equal(row, one)
+        else:
+            assert np.isnan(row).all() if last.dtype.kind == "f" else not row.any()
 
 
 def final(infos):
@@ -130,20 +162,68 @@ def test_the_form_is_that_of_gymnasium(task):
         mine, other = ours.step(actions)[4], theirs.step(actions)[4]
         assert ("final_obs" in mine) == ("final_obs" in other)
         if "final_obs" in mine:
+            mask = mine["_final_obs"]
+            require_last(
+                mine.pop("final_obs"), other.pop("final_obs"), mask, theirs.single_observation_space
+            )
             require_same_form(final(mine), final(other))
-            ends += int(mine["_final_obs"].sum())
+            ends += int(mask.sum())
     assert ends > NUM_ENVS
     ours.close()
     theirs.close()
 
 
-def observations_in(objects):
-    """The arrays in an array of objects."""
-    for value in objects:
-        if isinstance(value, dict):
-            yield from observations_in(value.values())
-        elif value is not None:
-            yield value
+def test_tuples_are_in_an_array_of_objects():
+    envs = made(Pair)
+    for infos in infos_of(envs):
+        last = infos["final_obs"]
+        assert (last.dtype, last.shape) == (object, (NUM_ENVS,))
+        assert [one is not None for one in last] == infos["_final_obs"].tolist()
+        for box, side in last[infos["_final_obs"]]:
+            assert BOX.contains(box)
+            assert side == (box[0] > 0.2)
+    envs.close()
+
+
+def arrays_in(last):
+    return (
+        [one for part in last.values() for one in arrays_in(part)]
+        if isinstance(last, dict)
+        else [last]
+    )
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_arrays_are_new_and_the_callers(task):
+    envs, held = made(task), []
+    for infos in infos_of(envs):
+        for array in arrays_in(infos["final_obs"]):
+            assert not any(np.shares_memory(array, one) for one, _ in held)
+            assert array.base is None
+            held.append((array, array.copy()))
+    assert all(
+        np.array_equal(array, kept, equal_nan=True)
+        for array, kept in held
+        if array.dtype.kind == "f"
+    )
+    envs.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_wrappers_of_gymnasium(task):
+    envs = made(task)
+    wrapped, ended = DictInfoToList(RecordEpisodeStatistics(envs)), 0
+    wrapped.reset(seed=0)
+    for actions in sampled_actions(envs, STEPS):
+        _, _, terminated, truncated, infos = wrapped.step(actions)
+        for index, info in enumerate(infos):
+            is_over = terminated[index] or truncated[index]
+            assert ("final_info" in info) == ("episode" in info) == is_over
+            if is_over:
+                assert envs.single_observation_space.contains(info["final_obs"])
+                ended += 1
+    assert ended > NUM_ENVS
+    wrapped.close()
 
 
 @functools.cache
@@ -154,55 +234,6 @@ def told(task):
     envs.close()
     assert len(copies) > 5
     return copies
-
-
-class Calling:
-    """An object that lets the environments step when nobody refers to it any more."""
-
-    def __init__(self, envs):
-        self.envs = envs
-
-    def __del__(self):
-        if not self.envs.closed:
-            self.envs.step(self.envs.action_space.sample())
-
-
-class Own(np.ndarray):
-    """Arrays of a class of the caller's."""
-
-
-def locked(array):
-    array.flags.writeable = False
-    return array
-
-
-FOREIGN = {
-    "number": lambda envs: 7,
-    "other type": lambda envs: np.zeros(4),
-    "other size": lambda envs: np.zeros(1, np.float32),
-    "view": lambda envs: np.zeros((9, 4), np.float32)[3],
-    "read-only": lambda envs: locked(np.full(4, np.nan, np.float32)),
-    "other byte order": lambda envs: np.full(4, np.nan, ">f4"),
-    "subclass": lambda envs: np.ndarray.__new__(Own, 4, np.float32),
-    "dict": lambda envs: {"state": 7, 3: np.zeros(2, np.float32)},
-    "object that steps": Calling,
-}
-
-
-@in_turn({"make": FOREIGN, "task": [CART_POLE, Named]})
-def test_objects_of_the_caller_do_not_come_back(task, make):
-    envs, own = made(task), set()
-    for infos in infos_of(envs):
-        objects, mask = infos["final_obs"], infos["_final_obs"]
-        own |= {type(value) for value in objects}
-        assert [value is not None for value in objects] == mask.tolist()
-        for row in observations_in(objects):
-            assert row.base is None
-            assert np.isfinite(row).all()
-        objects[:] = [make(envs) for _ in objects]
-        del infos, objects, mask, row
-    assert own == {type(None), dict if task is Named else np.ndarray}
-    envs.close()
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -216,7 +247,7 @@ def test_copies_are_plain_and_equal(task):
     envs.close()
 
 
-@in_turn({"task": [CART_POLE, Telling], "holds": [False, True]})
+@in_turn({"task": [CART_POLE, *COMPILED], "holds": [False, True]})
 def test_nothing_leaks(task, holds):
     envs = made(task, 12)
     watched = (None, True, False, "final_obs", "_final_obs", "final_info", "drawn", "state")
@@ -275,7 +306,7 @@ def with_failing(task, monkeypatch):
 
 
 @pytest.mark.skipif(testcapi is None, reason="this Python has no module _testcapi")
-@pytest.mark.parametrize("task", [CART_POLE, Telling])
+@pytest.mark.parametrize("task", COMPILED)
 def test_missing_memory_leaves_everything_in_order(task, monkeypatch):
     expected, failures = told(task), 0
     envs, failing = with_failing(task, monkeypatch)

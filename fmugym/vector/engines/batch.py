@@ -677,8 +677,10 @@ class BatchEngine(Engine):
         Raises:
             ConfigError: If a hook has raised the error, or returned what cannot be used.
         """
-        frames = (frame.f_code.co_name for frame, _ in walk_tb(error.__traceback__))
-        hook = next((name for name in frames if name in _ON_ARRAYS), None)
+        codes = [getattr(getattr(self.env, name), "__code__", None) for name in _ON_ARRAYS]
+        frames = [frame.f_code for frame, _ in walk_tb(error.__traceback__)]
+        named = zip(_ON_ARRAYS, codes, strict=True)
+        hook = next((name for name, code in named if code in frames), None)
         if isinstance(error, ConfigError):
             hook = next((name for name in _ON_ARRAYS if str(error).startswith(f"{name} ")), None)
         if hook is None or self._are_hooks_tried or isinstance(error, SimulationError):

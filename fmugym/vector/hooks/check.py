@@ -1,217 +1,253 @@
-"""The hook check: do hooks give the same on arrays as one environment at a time?
+"""The check of hooks: do they give on arrays what they give one environment at a time?
 
 ``if abs(x) > 2.4`` raises on arrays, but ``np.any`` and ``norm`` without an axis silently give one
-answer for all environments. So the check evaluates every hook on some distinct states both ways.
+answer for all environments, and a transposed observation has the right shape if there are as many
+environments as elements. So each hook is called both ways on the states of episodes, for several
+numbers of environments.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, Final, Literal
 
 import numpy as np
 from gymnasium import spaces
 
+from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
-from fmugym.fmi.status import WARNING_CODE
+from fmugym.errors import FMUGymError, shown
 from fmugym.pool.base import FloatArray
+from fmugym.task.actions import flat_inputs
+from fmugym.task.hooks import Hooks
+from fmugym.task.plain import changed, plain_attributes
 from fmugym.task.readings import Readings, reading
+from fmugym.task.results import as_flag, as_info, as_reward
 from fmugym.task.step import ORDER
-from fmugym.task.values import ParameterValues
-from fmugym.vector.action_arrays import is_array_space
-from fmugym.vector.contents import Contents, borrowed, differs
-from fmugym.vector.hooks.purity import unrepeatable
-from fmugym.vector.views import batched, column, some
+from fmugym.task.values import EpisodeVariables, ParameterValues
+from fmugym.vector.calls import take_back
+from fmugym.vector.codec import mapped
+from fmugym.vector.hooks import hook_results
+from fmugym.vector.views import batched, column
 
-__all__ = ["CURE", "find_difference", "sample_of", "sample_states", "states_around"]
+__all__ = ["CURE", "find_difference", "own_hooks"]
 
-CURE = (
+CURE: Final = (
     "Write hooks element-wise: & and | for 'and' and 'or', numpy.where for 'if', no reduction over "
     "all values"
 )
 """The advice that follows a difference."""
 
-_IDLE = ("_update", "_is_truncated", "_get_info")
-"""Hooks that do nothing by default."""
+_STEPS, _EPISODES = 200, 8
+"""The length of an episode, and how many there are at most."""
 
-_READ_ONLY = (
-    "state",
-    "previous_state",
-    "inputs",
-    "action",
-    "previous_action",
-    "step_count",
-    "done",
+_MOST_ROWS, _ROWS_AT_LIMITS = 480, 24
+"""Of all episodes, and how many of these are taken to limits."""
+
+_MOST_BATCHES: Final = 24
+"""Of one number of environments."""
+
+_FACTORS: Final = (-0.3, 10.0, 300.0, 1e5, -1e5)
+"""Of outputs, beside limits: other magnitudes than those that episodes reach."""
+
+_READ_ONLY: Final = (
+    *("values", "previous_state", "inputs", "action", "previous_action", "step_count", "done"),
 )
 
-_WRITING = ("_get_inputs", "_update")
-"""Hooks that are not called for environments that start an episode, and may write variables."""
+_WRITING: Final = ("_get_inputs", "_update")
+"""The hooks that may write episode variables."""
 
-_OUTSIDE = "outside: "
-"""Precedes the names of global variables among those of what hooks have changed."""
+_AT_STARTS: Final = ("_get_observation", "_get_info")
+"""The hooks whose results count where an episode has just started."""
 
-_EPISODES, _STEPS = 2, 3
-"""How many states of the FMU are tried; each is tried at other magnitudes, too."""
-
-_TOLERANCE = 1e-6
+_TOLERANCE: Final = 1e-6
 """numpy's results on arrays may differ from those on scalars in the last bit of a float32."""
 
-_SCALES = (1.0, -0.3, 10.0)
-_WILD_SCALES = (300.0, -1e5)
-"""Hooks may fail at these. They reach limits that the FMU's own states are far from."""
+Kind = Literal["step", "start", "failed", "limit"]
 
 
-def find_difference(env: FMUEnv, states: Readings | None = None) -> str | None:
-    """Look for a reason to call hooks one environment at a time.
+@dataclass(frozen=True)
+class _Row:
+    """What hooks read in one environment, which is of a kind.
+
+    Attributes:
+        kind: ``"step"``; ``"start"`` if an episode has just begun; ``"failed"`` if the FMU has not
+            done the step, so that nothing counts that hooks return; ``"limit"``, where they may
+            fail, too.
+        readings: What ``_is_done`` and the hooks after it read.
+        before: The episode variables before ``_update``.
+        done: What ``_is_done`` has returned.
+    """
+
+    kind: Kind
+    readings: Readings
+    before: dict[str, Any]
+    done: bool
+
+
+def find_difference(env: FMUEnv) -> str | None:
+    """Find a hook that gives something else on arrays than one environment at a time.
 
     Args:
-        env: A prototype.
-        states: States in which hooks may fail; None for those that the FMU takes, if its pool has
-            not been used yet, and others.
+        env: An environment that makes arrays, with a pool of its own; it plays episodes.
 
     Returns:
-        The hook and how it differs on arrays, or None if all hooks work on arrays.
+        The hook and what is wrong with it, or None.
     """
-    obstacle = _obstacle(env)
-    if obstacle is not None:
-        return obstacle
-    hooks = [hook for hook in ORDER if hook not in _IDLE or hook in env.inside.own]
-    with (
-        np.errstate(all="ignore"),
-        warnings.catch_warnings(),
-        borrowed(env, outside=True) as contents,
-    ):
+    hooks = own_hooks(env)
+    if not hooks:
+        return None
+    with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scales = _SCALES[:1], _SCALES[1:], _WILD_SCALES
-        kinds = [sample_states(env, some) for some in scales] if states is None else [states]
+        rng = np.random.default_rng(0)
+        rows = list(_rows(env, rng))
+        _spread_variables(rows)
+        limits = list(_at_limits(env, [one for one in rows if one.kind == "step"], rng))
         for name in hooks:
-            for index, batch in enumerate(kinds):
-                comparison = _Comparison(env, contents, batch, name)
-                may_fail = states is not None or index > 0
-                difference = comparison.run(is_natural=index == 0, may_fail=may_fail)
-                if difference is not None:
-                    return f"{name} {difference}"
+            try:
+                for count in _counts(env):
+                    for batch in (*_batches(rows, count), *_batches(limits, count)):
+                        _Comparison(env, name, batch).require_same()
+            except _DifferenceError as difference:
+                return f"{name} {difference}"
     return None
 
 
-def _obstacle(env: FMUEnv) -> str | None:
-    """What keeps hooks from being called on arrays, whatever they compute."""
-    for method, is_own in (("step", env.inside.own.step), ("reset", env.inside.own.reset)):
-        if is_own:
-            return f"{method} is overridden, which is for one environment only"
-    if not is_array_space(env.action_space):
-        return f"actions of {env.action_space} do not make one array"
-    if not _makes_arrays(env.observation_space):
-        return f"observations of {env.observation_space} do not make arrays"
-    return unrepeatable(env)
+def own_hooks(env: FMUEnv) -> list[str]:
+    """The hooks of a step that classes override."""
+    return [name for name in ORDER if _is_own(env, name)]
 
 
-def _makes_arrays(space: spaces.Space[Any]) -> bool:
-    """Whether observations of N environments are an array, or a dict of arrays."""
-    if isinstance(space, spaces.Dict):
-        return all(map(_makes_arrays, space.values()))
-    return is_array_space(space)
+def _is_own(env: FMUEnv, name: str) -> bool:
+    """Whether a hook is neither a default nor an expression."""
+    if name in vars(env):
+        return False
+    if name == "_reward_policy" and env.inside.own.goal_reward:
+        return True
+    return all(name in vars(cls) for cls in [_owner(type(env), name)]) and not _is_default(
+        env, name
+    )
 
 
-def sample_states(
-    env: FMUEnv, scales: Sequence[float] = _SCALES, visited: Sequence[Visited] | None = None
-) -> Readings:
-    """Make a batch of states, each in several magnitudes.
-
-    Args:
-        env: A prototype.
-        scales: The factors of the states, each with some noise.
-        visited: The states; by default those that the first instance of its pool takes.
-
-    Returns:
-        What hooks read in these states.
-    """
-    rng = np.random.default_rng(0)
-    visited = _visit_states(env, rng) if visited is None else visited
-    tried = [(state, scale) for state in visited for scale in scales]
-    batch = batched(env, len(tried))
-    rows: dict[str, list[Any]] = {}
-    for index, (state, scale) in enumerate(tried):
-        _place_sample(env, batch, index, state, rng, rows)
-        if scale != 1.0:
-            batch.values[:, index] *= scale * rng.uniform(0.5, 1.5, size=len(batch.values))
-            batch.previous_state[:, index] *= scale
-    for name, values in rows.items():
-        if name in batch.variables:
-            batch.variables[name] = np.moveaxis(np.array(values), 0, -1)
-    own = ((n, np.array(v)) for n, v in rows.items() if n not in batch.variables)
-    batch.parameters = ParameterValues(own)
-    return batch
+def _is_default(env: FMUEnv, name: str) -> bool:
+    owner = _owner(type(env), name)
+    return owner is Hooks or owner.__module__.startswith("fmugym.declared.")
 
 
-Visited = tuple[FloatArray, FloatArray, FloatArray]
-"""The outputs before a step, those after it, and the inputs."""
+def _owner(cls: type[Any], name: str) -> type[Any]:
+    return next(one for one in cls.__mro__ if name in vars(one))
 
 
-def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
-    """Run short episodes with small inputs; a slow FMU would take long for more."""
-    pool, draws = env.inside.pool, env.inside.draws
-    if pool.is_real:
-        zeros = np.zeros(len(pool.outputs)), np.zeros(len(pool.inputs))
-        return _drawn_around(*zeros, [1.0] * _EPISODES * _STEPS, rng)  # nothing real must move
-    mask = np.zeros(pool.num_instances, np.bool_)
-    mask[0] = True
-    visited: list[Visited] = []
-    for _ in range(_EPISODES):
-        start_values = draws.draw(rng).start_values
-        pool.reset(draws.model_variables, np.repeat(start_values, len(mask), axis=1), mask)
-        for _ in range(_STEPS):
-            before = pool.outputs[:, 0].copy()
-            pool.inputs[:, 0] = 0.1 * rng.uniform(size=len(pool.inputs))
-            if pool.statuses[0] <= WARNING_CODE:
-                pool.step(None, ~mask)
-            visited.append((before, pool.outputs[:, 0].copy(), pool.inputs[:, 0].copy()))
-    return visited
+# The states
 
 
-def states_around(env: FMUEnv, reaches: Sequence[float]) -> list[Visited]:
-    """Draw states around the one that a single environment has now.
-
-    Args:
-        env: The environment.
-        reaches: How far each is from there, relative to the magnitudes of the values.
-    """
-    now = env.inside.readings
-    values, inputs = (np.array(part, np.float64) for part in (now.values, now.inputs))
-    return _drawn_around(values, inputs, reaches, np.random.default_rng(0))
-
-
-def _drawn_around(
-    values: FloatArray, inputs: FloatArray, reaches: Sequence[float], rng: np.random.Generator
-) -> list[Visited]:
-    def moved(reach: float) -> Any:
-        centres = values, values, inputs
-        return tuple(c + reach * (1 + abs(c)) * rng.normal(size=len(c)) for c in centres)
-
-    return [moved(reach) for reach in reaches]
+def _rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
+    """Play episodes with actions inside of their range and at its ends."""
+    if env.inside.pool.is_real:
+        yield from _drawn_rows(env, rng)  # nothing real must move
+        return
+    rows: list[_Row] = []
+    for number in range(_EPISODES):
+        rows += _episode(env, rng, at_ends=number % 2 == 1)
+        if len(rows) > _MOST_ROWS:
+            break
+    yield from rows
 
 
-def _place_sample(
-    env: FMUEnv,
-    batch: Readings,
-    index: int,
-    visited: Visited,
-    rng: np.random.Generator,
-    rows: dict[str, list[Any]],
-) -> None:
-    before, batch.values[:, index], batch.inputs[:, index] = visited
-    batch.previous_state[:, index] = before[: env.inside.output_count]
-    batch.step_count[index] = 1 + index
-    batch.done[index] = bool(rng.integers(2))
-    for actions in (batch.action, batch.previous_action):
-        actions[..., index] = sample_of(env.action_space, rng)
-    episode = env.inside.draws.draw(rng)
-    for name, value in {**episode.parameters, **episode.variables}.items():
-        rows.setdefault(name, []).append(value)
+def _episode(env: FMUEnv, rng: np.random.Generator, *, at_ends: bool) -> list[_Row]:
+    env.reset(seed=int(rng.integers(2**31)))
+    rows, variables = [_row_of(env, "start", dict(env.variables))], dict(env.variables)
+    for _ in range(_STEPS):
+        action = _sample_of(env.action_space, rng)
+        try:
+            *_, terminated, truncated, info = env.step(_at_end(env.action_space, action, at_ends))
+        except FMUGymError:
+            break  # a fault, or an action that makes no input
+        if "fault" in info:
+            break
+        rows.append(_row_of(env, "step", variables))
+        variables = dict(env.variables)
+        if terminated or truncated:
+            break
+    return rows
 
 
-def sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
+def _at_end(space: Any, action: Any, at_ends: bool) -> Any:
+    """The nearest end of the range of an action."""
+    if not at_ends or not isinstance(space, spaces.Box) or not space.is_bounded():
+        return action
+    nearer = np.asarray(action, np.float64) * 2 > np.asarray(space.high, np.float64) + space.low
+    return np.where(nearer, space.high, space.low).astype(space.dtype)
+
+
+def _row_of(env: FMUEnv, kind: Kind, before: Mapping[str, Any]) -> _Row:
+    now = Readings.of(env)
+    parameters = MappingProxyType(ParameterValues(now.parameters))
+    variables = _variables(now.variables)
+    kept = replace(now, parameters=parameters, variables=variables)
+    kept.action, kept.previous_action = np.array(now.action), np.array(now.previous_action)
+    return _Row(kind, kept, dict(before), bool(now.done))
+
+
+def _variables(values: Mapping[str, Any]) -> EpisodeVariables:
+    variables = EpisodeVariables(values)
+    variables.update({name: np.copy(one) if np.ndim(one) else one for name, one in values.items()})
+    return variables
+
+
+def _spread_variables(rows: Sequence[_Row]) -> None:
+    """Give each variable the shape that it has in later steps everywhere."""
+    for name in rows[0].readings.variables:
+        held = [part for row in rows for part in (row.readings.variables, row.before)]
+        shape = np.broadcast_shapes(*(np.shape(part[name]) for part in held))
+        for part in held if shape else ():
+            part[name] = np.array(np.broadcast_to(part[name], shape))
+
+
+def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
+    """States around zero, of episodes that nobody has played."""
+    for index in range(_STEPS // 4):
+        episode, now = env.inside.draws.draw(rng), env.inside.own_readings
+        values = tuple(rng.normal(size=len(now.values)).tolist())
+        variables = _variables(now.variables | episode.variables)
+        kept = replace(
+            now,
+            values=values,
+            previous_state=tuple(rng.normal(size=env.inside.output_count).tolist()),
+            inputs=tuple(rng.normal(size=len(now.inputs)).tolist()),
+            action=np.array(_sample_of(env.action_space, rng)),
+            previous_action=np.array(_sample_of(env.action_space, rng)),
+            step_count=index,
+            parameters=MappingProxyType(ParameterValues(episode.parameters)),
+            variables=variables,
+        )
+        yield _Row("step", kept, dict(variables), bool(rng.integers(2)))
+
+
+def _at_limits(env: FMUEnv, rows: Sequence[_Row], rng: np.random.Generator) -> Iterator[_Row]:
+    """Rows whose outputs are at the ends of their ranges, or of another magnitude."""
+    variables = env.inside.interface.outputs + env.inside.interface.monitors
+    lows, highs = (np.array(one, np.float64) for one in zip(*map(_ends_of, variables), strict=True))
+    for row in rows[:: 1 + len(rows) // _ROWS_AT_LIMITS]:
+        values = np.array(row.readings.values)
+        places = [np.where(np.isfinite(ends), ends, values) for ends in (lows, highs)]
+        places += [values * factor * rng.uniform(0.5, 1.5, len(values)) for factor in _FACTORS]
+        for place in places:
+            before = place[: env.inside.output_count] * rng.uniform(0.9, 1.0)
+            moved = replace(
+                row.readings, values=tuple(place.tolist()), previous_state=tuple(before.tolist())
+            )
+            yield _Row("limit", moved, row.before, bool(rng.integers(2)))
+
+
+def _ends_of(variable: Variable) -> tuple[float, float]:
+    return variable.minimum, variable.maximum
+
+
+def _sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
     """Sample without touching the space's own generator."""
     own, space._np_random = space._np_random, rng
     try:
@@ -220,115 +256,290 @@ def sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
         space._np_random = own
 
 
-class _Comparison(NamedTuple):
-    """Compares one hook on arrays with the same hook one environment at a time.
+# Batches of them
+
+
+def _counts(env: FMUEnv) -> tuple[int, ...]:
+    """Numbers of environments: one that no length of the task equals, one that does, and 1."""
+    arrays = spaces.flatten_space(env.observation_space).shape or (1,)
+    inside = env.inside
+    lengths = {*arrays, *np.shape(inside.no_action), inside.output_count}
+    lengths |= {len(inside.start_inputs), len(inside.own_readings.values)}
+    for part in _boxes(env.observation_space):
+        lengths |= set(part.shape)
+    for value in env.variables.values():
+        lengths |= set(np.shape(value))
+    other = next(n for n in range(23, 10_000) if n not in lengths)
+    width = next((part.shape[-1] for part in _boxes(env.observation_space) if part.shape), 1)
+    return (other, width, 1) if 1 < width <= _MOST_ROWS else (other, 1)
+
+
+def _boxes(space: spaces.Space[Any]) -> Iterator[Any]:
+    """The parts of a space that are arrays."""
+    if isinstance(space, spaces.Dict):
+        for part in space.values():
+            yield from _boxes(part)
+    elif space.shape is not None:
+        yield space
+
+
+def _batches(rows: Sequence[_Row], count: int) -> Iterator[list[_Row]]:
+    """Divide rows of all kinds into batches of so many, of which there are not too many."""
+    mixed = np.random.default_rng(1).permutation(len(rows)).tolist()
+    starts = range(0, len(mixed), max(count, 1 + len(mixed) // _MOST_BATCHES))
+    for start in starts:
+        chosen = [rows[i] for i in (mixed[start:] + mixed)[:count]]
+        while len(chosen) < count:
+            chosen += chosen[: count - len(chosen)]
+        if count > 4 and chosen[1].kind == "step":
+            chosen[1] = replace(chosen[1], kind="failed")
+        yield chosen
+
+
+def _batch_of(env: FMUEnv, rows: Sequence[_Row], name: str) -> Readings:
+    """What a hook reads in environments, in arrays."""
+    batch = batched(env, len(rows))
+    states = [_moment(env, row, name) for row in rows]
+    for index, one in enumerate(states):
+        batch.values[:, index], batch.previous_state[:, index] = one.values, one.previous_state
+        batch.inputs[:, index], batch.step_count[index] = one.inputs, one.step_count
+        batch.action[..., index] = one.action
+        batch.previous_action[..., index] = one.previous_action
+        batch.done[index] = one.done
+    for variable in batch.variables:
+        values = np.array([one.variables[variable] for one in states])
+        batch.variables[variable] = np.moveaxis(values, 0, -1).copy()
+    names = states[0].parameters
+    batch.parameters = MappingProxyType(
+        ParameterValues((n, _array_of([one.parameters[n] for one in states])) for n in names)
+    )
+    return batch
+
+
+def _array_of(values: list[Any]) -> Any:
+    return np.array(values, object if isinstance(values[0], str) else None)
+
+
+def _moment(env: FMUEnv, row: _Row, name: str) -> Readings:
+    """What a hook reads in one environment: not all is known yet when the first are called."""
+    now = row.readings
+    if name not in _WRITING:
+        return replace(now, done=row.done and name != "_is_done")
+    variables = _variables(row.before)
+    if name == "_update":
+        return replace(now, variables=variables, done=False)
+    values = (*now.previous_state, *now.values[env.inside.output_count :])
+    return replace(now, variables=variables, values=values, done=False)
+
+
+# The comparison
+
+
+class _DifferenceError(Exception):
+    """What is wrong with a hook."""
+
+
+class _FailureError(Exception):
+    """What a hook has raised."""
+
+
+@dataclass
+class _Comparison:
+    """Compares a hook on arrays with the same hook one environment at a time.
 
     Attributes:
-        env: The prototype, whose hook is called.
-        contents: What the prototype holds; each call is undone.
-        batch: What hooks read.
+        env: Whose hook is called.
         name: The hook.
+        rows: What it reads.
     """
 
     env: FMUEnv
-    contents: Contents
-    batch: Readings
     name: str
+    rows: Sequence[_Row]
 
-    def run(self, is_natural: bool, may_fail: bool) -> str | None:
-        """Say how the results differ, or None."""
-        count = len(self.batch.step_count)
-        calls = [self._call(column(self.batch, index)) for index in range(count)]
-        changed = next((name for _, name in calls if name is not None), None)
-        if changed == "variables":
-            return "changes self.variables, which only _update may do"
-        if changed is not None and changed.startswith(_OUTSIDE):
-            return f"changes {changed.removeprefix(_OUTSIDE)}, which all environments share"
-        if is_natural and changed is not None:
-            return f"changes self.{changed}, which belongs in 'episode_variables'"
-        failures = sum(type(result) is _Failure for result, _ in calls)
-        if failures == count or (failures and may_fail):
-            return None  # if it fails either way, the first step will tell
-        together, changed = self._call(some(self.batch))
-        if changed in {"state", "out"}:  # the same arrays
-            return "changes the arrays in self.state and self.out in place"
-        if changed in _READ_ONLY:
-            return f"changes the arrays in self.{changed} in place"
-        if type(together) is _Failure:
-            return f"fails on arrays ({together.text})"
-        for index, (expected, _) in enumerate(calls):
-            if type(expected) is not _Failure and not _same(expected, together, index, count):
-                return "gives other values on arrays than one environment at a time"
-        return None
+    def require_same(self) -> None:
+        """Raise a ``_DifferenceError`` if the results differ, or the hook changes something."""
+        batch = _batch_of(self.env, self.rows, self.name)
+        alone = self._alone(batch)
+        failing = [i for i, row in enumerate(self.rows) if row.kind == "limit" and i not in alone]
+        if failing:  # as they do on arrays, rightly
+            kept = [row for i, row in enumerate(self.rows) if i not in failing]
+            if kept:
+                replace(self, rows=(kept * len(self.rows))[: len(self.rows)]).require_same()
+            return
+        first, second = self._together(batch), self._together(batch)
+        for index, row in enumerate(self.rows):
+            if self._counts(row):
+                self._compare(row, alone[index], *(_part(one, index) for one in (first, second)))
 
-    def _call(self, readings: Readings) -> tuple[Any, str | None]:
-        """Call the hook; return its result and the name of an attribute that it changes."""
-        before = _read_only(readings, self.name)
-        with reading(self.env, readings):
-            result = _result_of(self.env, self.name)
-            after = _read_only(Readings.of(self.env), self.name)
-        changed = [name for name, row in before.items() if differs(row, after[name])]
-        changes = self.contents.changes()
-        if any(changes):
-            self.contents.restore()
-        attribute = changes.inside
-        if attribute is None and changes.outside is not None:
-            attribute = f"{_OUTSIDE}{changes.outside}"
-        return result, changed[0] if changed else attribute
+    @property
+    def _where(self) -> str:
+        count = len(self.rows)
+        return f"on the arrays of {count} environment{'s' if count > 1 else ''}"
+
+    def _alone(self, batch: Readings) -> dict[int, Any]:
+        """The results one environment at a time, as far as there are any."""
+        found: dict[int, Any] = {}
+        for index, row in enumerate(self.rows):
+            try:
+                found[index] = self._called(column(batch, index), self._of_one)
+            except _FailureError as failure:
+                if row.kind != "limit" and self._counts(row):
+                    raise _DifferenceError(f"fails for one environment: {failure}") from None
+        return found
+
+    def _together(self, batch: Readings) -> Any:
+        try:
+            return self._called(batch.mapped(lambda values: np.array(values)), self._of_many)
+        except _FailureError as failure:
+            raise _DifferenceError(f"fails {self._where}: {failure}") from None
+
+    def _compare(self, row: _Row, alone: Any, first: Any, second: Any) -> None:
+        if not _same(first, second):
+            raise _DifferenceError(f"gives other values {self._where} when it is called again")
+        if not _same(alone, first):
+            raise _DifferenceError(
+                f"gives {shown(first)} {self._where} {_WHICH[row.kind]}, where it gives "
+                f"{shown(alone)} for that environment alone"
+            )
+
+    def _counts(self, row: _Row) -> bool:
+        """Whether the result of a row is ever used."""
+        if row.kind == "start":
+            return self.name in _AT_STARTS
+        return row.kind != "failed"
+
+    def _called(self, readings: Readings, of: Callable[[Any], Any]) -> Any:
+        """Call the hook; return its result, if it has changed only what it may.
+
+        Raises:
+            _DifferenceError: If it has changed something else.
+            _FailureError: If the hook fails, or returns what cannot be used.
+        """
+        env = self.env
+        before, attributes = _values_in(readings, self.name), dict(vars(env))
+        plain = plain_attributes(attributes, env.inside.own_names)
+        try:
+            with reading(env, readings):
+                value = of(getattr(env, self.name)())
+                after = _values_in(Readings.of(env), self.name)
+            _require_unchanged(before, after)
+            _require_attributes(env, attributes, plain)
+            return value
+        except _DifferenceError:
+            raise
+        except FMUGymError as error:
+            raise _FailureError(str(error)) from error
+        except Exception as error:  # hooks may raise anything
+            raise _FailureError(f"{type(error).__name__}: {error}") from error
+        finally:
+            take_back(env, attributes)
+
+    # The results
+
+    def _of_one(self, value: Any) -> Any:
+        """The result in one environment."""
+        match self.name:
+            case "_get_inputs":
+                return flat_inputs(value, self.env.inside.interface.inputs, shown)
+            case "_update":
+                return {name: np.asarray(one) for name, one in self.env.variables.items()}
+            case "_is_done" | "_is_truncated":
+                return as_flag(self.name, value)
+            case "_reward_policy":
+                return as_reward(value)
+            case "_get_info":
+                return as_info(value)
+        return mapped(np.asarray, value)
+
+    def _of_many(self, value: Any) -> Any:
+        """The results in all environments, which come first in arrays."""
+        env, count = self.env, len(self.rows)
+        match self.name:
+            case "_get_inputs":
+                inputs = np.empty((len(env.inside.start_inputs), count))
+                hook_results.write_inputs(value, inputs)
+                return inputs.T
+            case "_update":
+                return {
+                    name: np.moveaxis(hook_results.variable(name, one, count), -1, 0)
+                    for name, one in env.variables.items()
+                }
+            case "_is_done" | "_is_truncated":
+                return hook_results.flags(self.name, value, count)
+            case "_reward_policy":
+                return hook_results.rewards(value, count)
+            case "_get_info":
+                return hook_results.info_arrays(value, np.ones(count, np.bool_))
+        return hook_results.observations(value, env.observation_space, count)
 
 
-def _read_only(readings: Readings, hook: str) -> dict[str, Any]:
-    """Copy the readings that a hook must not change, by the names of the attributes."""
-    rows: dict[str, Any] = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
+_WHICH: Final[Mapping[str, str]] = {
+    "step": "for one of them",
+    "start": "for one whose episode has just begun",
+    "limit": "for one whose outputs are at a limit, or far from those of episodes",
+}
+
+
+def _require_unchanged(before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
+    """Raise a ``_DifferenceError`` if a hook has changed what it reads."""
+    for name, value in before.items():
+        if name == "variables" and not _same(value, after[name]):
+            raise _DifferenceError(
+                "changes self.variables, which only _get_inputs and _update may do"
+            )
+        if not _same(value, after[name]):
+            told = "state and self.out" if name == "values" else name
+            raise _DifferenceError(f"changes the arrays in self.{told} in place")
+
+
+def _require_attributes(env: FMUEnv, before: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
+    """Raise a ``_DifferenceError`` if a hook has kept something in an attribute."""
+    now = vars(env)
+    new = [name for name, value in now.items() if name not in before or before[name] is not value]
+    new += changed(plain_attributes(now, env.inside.own_names), plain)
+    for name in new:
+        if name not in env.inside.own_names:
+            raise _DifferenceError(f"changes self.{name}, which belongs in 'episode_variables'")
+
+
+def _values_in(readings: Readings, hook: str) -> dict[str, Any]:
+    """Copies of what a hook must not change."""
+    kept: dict[str, Any] = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
     if hook not in _WRITING:
-        variables = readings.variables.items()  # a hook may have written anything
-        rows["variables"] = {n: v.copy() if type(v) is np.ndarray else v for n, v in variables}
-    return rows | {"out": np.copy(readings.values)}
+        kept["variables"] = {name: np.copy(one) for name, one in readings.variables.items()}
+    return kept
 
 
-class _Failure(NamedTuple):
-    """Stands for the result of a hook that has raised an exception."""
+def _part(results: Any, index: int) -> Any:
+    """The results of one environment; the masks of infos are left out."""
+    if isinstance(results, Mapping):
+        return {
+            name: _part(one, index)
+            for name, one in results.items()
+            if not (name.startswith("_") and name[1:] in results)
+        }
+    return results[index]
 
-    text: str
 
-
-def _result_of(env: FMUEnv, name: str) -> Any:
+def _same(expected: Any, found: Any) -> bool:
+    """Whether two results are equal, as far as rounding allows; NaNs are equal."""
     try:
-        result = getattr(env, name)()
-    except Exception as error:
-        return _Failure(f"{type(error).__name__}: {error}")
-    return dict(env.variables) if name == "_update" else result
-
-
-def _same(expected: Any, together: Any, index: int, count: int) -> bool:
-    """Whether one environment's part of a result on arrays is its result alone; NaNs are equal."""
-    try:
-        return _equal(expected, together, index, count)
+        if isinstance(expected, Mapping):
+            return expected.keys() == found.keys() and all(
+                _same(expected[name], found[name]) for name in expected
+            )
+        return _equal(np.asarray(expected), np.asarray(found))
     except Exception:  # the results are the user's, and may be anything
         return False
 
 
-def _equal(expected: Any, together: Any, index: int, count: int) -> bool:
-    if isinstance(expected, Mapping):
-        if not isinstance(together, Mapping) or expected.keys() != together.keys():
-            return False
-        return all(_same(expected[k], together[k], index, count) for k in expected)
-    if isinstance(expected, list | tuple) and isinstance(together, list | tuple):
-        return len(expected) == len(together) and all(
-            _same(a, b, index, count) for a, b in zip(expected, together, strict=True)
-        )
-    alone, batch = np.asarray(expected), np.asarray(together)
-    if isinstance(together, np.bool_) or (isinstance(together, np.ndarray) and batch.ndim == 0):
-        return False  # numpy has reduced the array: this is no constant
-    if batch.ndim == 0:  # a constant, the same for all
-        part = batch[()]
-    elif batch.shape[-1] != count:
+def _equal(expected: FloatArray, found: FloatArray) -> bool:
+    if expected.shape != found.shape and expected.size != found.size:
         return False
-    else:
-        part = batch[..., index]
-    if np.shape(part) != alone.shape and np.size(part) != alone.size:
-        return False
-    if alone.dtype.kind not in "biuf" or np.asarray(part).dtype.kind not in "biuf":
-        return bool(np.array_equal(alone, part))
-    same = np.isclose(np.ravel(alone), np.ravel(part), rtol=_TOLERANCE, atol=1e-9, equal_nan=True)
-    return bool(np.all(same))
+    if expected.dtype.kind not in "biufc" or found.dtype.kind not in "biufc":
+        return bool(np.array_equal(expected, found))
+    first, second = expected.ravel(), found.ravel()
+    finite = np.abs(first[np.isfinite(first)])
+    slack = _TOLERANCE * float(finite.max(initial=1e-3))
+    return bool(np.allclose(second, first, rtol=_TOLERANCE, atol=slack, equal_nan=True))
