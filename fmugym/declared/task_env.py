@@ -12,7 +12,6 @@ from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
-from fmugym.task.step import ORDER
 
 __all__ = ["TaskEnv"]
 
@@ -20,11 +19,6 @@ __all__ = ["TaskEnv"]
 _ARGUMENTS: Final = (
     *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "master", "scenario"),
 )
-
-_NOT_DECLARED: Final = frozenset(
-    {*ORDER, "step", "reset", "_get_action_space", "_get_observation_space", "_goal_reward"}
-)
-"""What a class may have of its own, so that hooks are more than the formulas of the task."""
 
 
 class TaskEnv(FMUEnv):
@@ -88,15 +82,10 @@ class TaskEnv(FMUEnv):
         self._observation_names, self._masks = resolved.observation_names, resolved.action_masks
         own = _own_hooks(type(self))
         own |= {"_explain"} if "_reward_policy" in own else set()
-        functions = {
-            name: MethodType(function, self)
-            for name, function in resolved.hooks.items()
-            if name not in own
-        }
-        for name, function in functions.items():
-            setattr(self, name, function)
-        if not own & _NOT_DECLARED:
-            self.inside.formulas = resolved.formulas, functions
+        for name, function in resolved.hooks.items():
+            if name not in own:
+                setattr(self, name, MethodType(function, self))
+        self.inside.formulas = resolved.formulas
         with self.task.root.placing():
             super().__init__(
                 source,
@@ -128,10 +117,6 @@ class TaskEnv(FMUEnv):
         if self._masks is None:
             raise ConfigError("action_masks needs actions with 'levels'")
         return self._masks(self)
-
-    def _is_done(self) -> Any:
-        """Episodes of a task that says nothing about their end are only truncated."""
-        return False
 
 
 def _own_hooks(cls: type[TaskEnv]) -> set[str]:

@@ -27,6 +27,7 @@ from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.graph import Graph, Node
 from fmugym.expressions.program import UntraceableError
 from fmugym.expressions.value import Value
+from fmugym.task.inside import is_overridden
 from fmugym.vector.hooks.formula_programs import Translation, written_variables
 
 __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
@@ -168,17 +169,13 @@ def _formulas_of(env: FMUEnv) -> Formulas:
     Raises:
         ConfigError: If a hook is a function of Python.
     """
-    formulas, functions = env.inside.formulas
-    base = env.inside.base
     for hook, key in _KEYS.items():
-        own = vars(env).get(hook)
-        if own is not functions.get(hook) or getattr(type(env), hook) is not getattr(base, hook):
-            name = type(env).__name__
+        if is_overridden(env, env.inside.base, hook):
             raise ConfigError(
-                f"{name} cannot be exported: its hook {hook} is a function of Python; write "
-                f"expressions under the key {key!r} instead"
+                f"{type(env).__name__} cannot be exported: its hook {hook} is a function of "
+                f"Python; write expressions under the key {key!r} instead"
             )
-    return formulas or Formulas(None, (), None, None, None, None, {})
+    return env.inside.formulas or Formulas(Graph(), None, (), None, None, None, None, {})
 
 
 class _Sample:

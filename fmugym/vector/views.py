@@ -27,8 +27,8 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     outputs = np.zeros((len(env.out), count)) if outputs is None else outputs
     space: Any = env.action_space
     action = np.zeros((*space.shape, count), space.dtype)
-    variables = EpisodeVariables(env.config.episode_variables)
-    starts = env.config.episode_variables
+    variables = EpisodeVariables(env.config.variable_starts)
+    starts = env.config.variable_starts
     variables.update({name: np.zeros((*np.shape(starts[name]), count)) for name in variables})
     return Readings(
         values=outputs,

@@ -15,6 +15,7 @@ from fmugym.expressions.lowering import Store, compile_graph
 from fmugym.expressions.program import Program, UntraceableError, letter_of
 from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
+from fmugym.task.inside import is_overridden
 from fmugym.task.step import ORDER
 from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
 
@@ -28,14 +29,11 @@ _Seen = tuple[SeenArray, list[Value]]
 
 
 def formulas_of(env: FMUEnv) -> Formulas | None:
-    """The formulas that the hooks of an environment are; None if one of them is another function.
-
-    A function that is assigned to a hook later takes the place of its formula.
-    """
-    formulas, functions = env.inside.formulas
-    assigned = vars(env)
-    is_same = all(assigned.get(name) is functions.get(name) for name in ORDER)
-    return formulas if is_same else None
+    """The formulas that all hooks of a step are; None if the class overrides one of them."""
+    inside = env.inside
+    hooks = (*ORDER, "_goal_reward")
+    is_own = any(is_overridden(env, inside.base, hook) for hook in hooks)
+    return None if is_own else inside.formulas
 
 
 def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
@@ -158,6 +156,8 @@ class Translation:
             return self._loaded(name, keys[0] if keys else 0)
         if name == "time":
             return self._time()
+        if name == "after_end":
+            return Value.of(self._graph, False)
         quantity = QUANTITIES[name]
         kind = quantity.after if self._has_stepped else quantity.before
         if kind is None:

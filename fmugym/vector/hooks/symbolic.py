@@ -49,7 +49,7 @@ def symbolic_readings(
     parameters = {name: rows((), "parameter", name) for name in known}
     read.parameters = MappingProxyType(_SymbolicParameters(parameters, strings))
     for name, dtype in variables.items():
-        shape = np.shape(env.config.episode_variables[name])
+        shape = np.shape(env.config.variable_starts[name])
         head = "before" if judging else "variable", name
         read.variables[name] = rows(shape, *head, dtype=dtype)
     return read
