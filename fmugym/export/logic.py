@@ -369,11 +369,13 @@ class _Assembly:
             self._add("inputs", np.dtype(np.float64), self._first_inputs(), self._sample.inputs)
         if reads["action"] or reads["previous_action"]:
             self._add_actions(has_older=bool(reads["previous_action"]))
-        kept, given = ({name for name, *_ in reads[kind]} for kind in ("before", "parameter"))
-        for name in filter(kept.__contains__, self._starts):
-            self._add_variable(name)
-        for name in filter(given.intersection(self._drawn).__contains__, self._episode.parameters):
-            self._add_parameter(name)
+        read, given = ({name for name, *_ in reads[kind]} for kind in ("before", "parameter"))
+        for name in self._starts:  # those that never change are constants
+            if name in read and (name in self._sample.updates or name in self._drawn):
+                self._add_variable(name)
+        for name in self._episode.parameters:
+            if name in given and name in self._drawn:
+                self._add_parameter(name)
 
     def _output_node(self, place: int) -> int:
         """The node of a measurement, which the graph gets if it has none yet."""
@@ -447,8 +449,10 @@ class _Assembly:
                 return ("count",)
             case "given":
                 return _GIVEN, row[1]
-            case "before":
+            case "before" if row[1] in self._fields:
                 return "kept", self._fields[row[1]], row[2]
+            case "before":
+                return "constant", float(np.ravel(self._starts[row[1]])[row[2]])
             case "parameter" if row[1] in self._drawn:
                 return "kept", self._fields[row[1]], 0
             case "parameter":
