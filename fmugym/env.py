@@ -30,7 +30,6 @@ from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.beginning import FIRST, BeginningOfOne
 from fmugym.task.construction import Constructed, draws_of_reset, prepare_hooks
-from fmugym.task.inside import is_overridden
 from fmugym.task.interface import readable_named
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
@@ -410,10 +409,10 @@ class FMUEnv(Constructed):
     @property
     def observation_names(self) -> tuple[str, ...] | None:
         """The names of the observation's elements; None if a hook of the class makes it."""
-        if is_overridden(self, FMUEnv, "_get_observation"):
+        if type(self)._get_observation is not FMUEnv._get_observation:
             return None
-        names = tuple(one.text for one in self.config.observations)
-        return names or tuple(v.name for v in self.inside.interface.outputs)
+        expressions = tuple(one.text for one in self.config.observations)
+        return expressions or tuple(v.name for v in self.inside.interface.outputs)
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
