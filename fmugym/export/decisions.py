@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 
 from fmugym.baselines.controller import Controller
 from fmugym.baselines.feedback import Law
@@ -65,16 +64,14 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     model = model.policy() if isinstance(model, Agent) else model
     if isinstance(model, Controller):
         policy = deepcopy(model) if isinstance(model, Policy) else Policy(deepcopy(model))
-        return _of_policy(policy.bind(env), env.observation_space)
+        return _of_policy(policy.bind(env))
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     if are_scaled(network.space, env.action_space):
         network = network.unscaled(env.action_space)
     return Decision(network, lambda seen, memory, ask: (network.chosen(ask(seen)), ()))
 
 
-def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
-    if not isinstance(observed, spaces.Box):
-        raise ConfigError(f"a policy that observes {observed} cannot be exported; a Box can be")
+def _of_policy(policy: Policy) -> Decision:
     if policy.choices and policy.masks is not None:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
     controller, past = policy.baseline, policy.starts

@@ -349,7 +349,7 @@ class Policy(Controller):
             last, leaky, told = self._memory
             change, leaky = _change(observed, last), _faded(observed, last, leaky)
             features = np.concatenate([observed, change, leaky, told], axis=-1)
-        action = self._corrected([*base], self._network(features))
+        action = self._with_changes([*base], self._network(features))
         if self._memory:
             self._memory = observed, leaky, np.stack(self._told(action), axis=-1)
         return action
@@ -395,14 +395,14 @@ class Policy(Controller):
         if not self.agent.acting:
             return base, ()
         if not memory:
-            return self._corrected(base, network(observation[: self.agent.observed])), ()
+            return self._with_changes(base, network(observation[: self.agent.observed])), ()
         last, leaky, told = memory
         change = list(map(_change, observation, last))
         leaky = list(map(_faded, observation, last, leaky))
-        action = self._corrected(base, network([*observation, *change, *leaky, *told]))
+        action = self._with_changes(base, network([*observation, *change, *leaky, *told]))
         return action, (observation, leaky, self._told(action))
 
-    def _corrected(self, base: Sequence[Any], changes: Sequence[Any]) -> list[Any]:
+    def _with_changes(self, base: Sequence[Any], changes: Sequence[Any]) -> list[Any]:
         """The elements of the action, of what the controller and the network say."""
         if self.choices:
             return list(changes)

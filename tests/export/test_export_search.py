@@ -2,7 +2,6 @@
 
 import shutil
 import sys
-from contextlib import closing
 from dataclasses import replace
 
 import gymnasium
@@ -11,7 +10,7 @@ import pytest
 from combinations import in_turn
 from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
-from test_export import HEATING, PRESENT, TASKS, Plain, Shifted
+from test_export import HEATING, PRESENT, TASKS, Shifted
 from test_export_fmu import controller_of, sampling
 
 import fmugym
@@ -271,19 +270,6 @@ class TestRefused:
             agent_of(env, agent)
         env.close()
         other.close()
-
-    def test_what_is_no_box(self):
-        class Choosing(Plain):
-            def _get_observation_space(self):
-                return gymnasium.spaces.Discrete(2)
-
-            def _get_observation(self):
-                return np.int64(self.state[0] > 0)
-
-        with closing(Choosing()) as env:
-            agent = agent_for(env, None, LINEAR)
-            with pytest.raises(ConfigError, match=r"Discrete\(2\).*Box"):
-                agent_of(env, agent)
 
 
 def test_by_the_command_line(tmp_path, ran, load):
