@@ -134,7 +134,7 @@ class Loops:
 
     @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House", "CloudPendulum"])
     def test_of_registered_tasks(self, env_id, tmp_path):
-        env = gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
+        env = made(env_id)
         network, language = network_for(env), self.languages[-1]
         agent = agent_of(env, network, all_inputs=True)
         measured, written, steps = closed_loop(
