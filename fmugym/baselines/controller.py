@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
-from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -13,10 +12,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
+from fmugym.baselines.measuring import Formula, formula_of, of_rows
 from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.expressions.by_numpy import function_of
-from fmugym.expressions.graph import Graph
 from fmugym.expressions.value import Value, where
 
 __all__ = [
@@ -37,14 +35,7 @@ Numbers = float | FloatArray
 """A number, or an array of shape (N,) with one for each environment."""
 
 Signal = str | Numbers
-"""An element of the observation by name, or a constant."""
-
-
-Formula = Callable[[Sequence[Value]], Value]
-"""A function of the elements of an observation."""
-
-MakeSignal = Callable[[str, Sequence[str]], Formula]
-"""See ``Inside.signal_of``."""
+"""An element of the observation by name, an expression of them, or a constant."""
 
 
 class Controller(KnownArguments, ABC):
@@ -60,7 +51,6 @@ class Controller(KnownArguments, ABC):
     """
 
     is_physical: ClassVar[bool] = True
-    _make_signal: MakeSignal | None
     _signals: dict[str, tuple[Formula, Callable[[Any], Any]]]
 
     space: spaces.Space[Any]
@@ -90,7 +80,7 @@ class Controller(KnownArguments, ABC):
         self.space = env.single_action_space if self._is_vector else env.action_space
         self.time_step = attribute_of(env, "config").time_step
         self.names = self._names_of(env) if names is None else tuple(names)
-        self._make_signal, self._signals = _maker_of_signals(env), {}
+        self._signals = {}
         self._prepare()
         self.reset()
         return self
@@ -193,17 +183,17 @@ class Controller(KnownArguments, ABC):
         return observation[0].beside(signal)
 
     def _check_signal(self, what: str, signal: Signal) -> None:
-        """Check a signal; one that is no name may be an expression, if a task is declared."""
+        """Check a signal; one that is no name may be an expression."""
         if not isinstance(signal, str):
             self._check_size(what, check_numbers(what, signal))
-        elif self._make_signal is None or signal.isidentifier() or self._is_name(signal):
+        elif signal.isidentifier() or self._is_name(signal):
             self._check_name(what, signal)
             place = self._place_of(signal)
             self._signals[signal] = itemgetter(place), itemgetter((slice(None), place))
         else:
             try:
-                formula = self._make_signal(signal, self.names)
-                self._signals[signal] = formula, _of_rows(formula, len(self.names))
+                formula = formula_of(signal, self.names)
+                self._signals[signal] = formula, of_rows(formula, len(self.names))
             except ConfigError as error:
                 raise ConfigError(f"{what}: {error}") from None
 
@@ -266,24 +256,6 @@ class Controller(KnownArguments, ABC):
     def _shape(self) -> str:
         width = len(self.names)
         return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
-
-
-def _maker_of_signals(env: Any) -> MakeSignal | None:
-    """See ``Inside.signal_of``; None for what is no environment."""
-    is_env = hasattr(env.unwrapped, "inside")
-    make: MakeSignal | None = attribute_of(env, "inside").signal_of if is_env else None
-    return make
-
-
-def _of_rows(formula: Formula, width: int) -> Callable[[Any], Any]:
-    """The function of observations of shape (N, k) that returns a signal of shape (N,)."""
-    graph = Graph()
-    value = formula([Value.read(graph, "columns", place) for place in range(width)])
-    constant = value.constant
-    if constant is not None:
-        return lambda rows: np.full(len(rows), float(constant))
-    evaluate = function_of(value)
-    return lambda rows: evaluate(SimpleNamespace(columns=rows.T))
 
 
 def limited(values: Any, low: Any, high: Any) -> Any:

@@ -6,7 +6,6 @@ import logging
 from types import MethodType
 from typing import Any, Final, Never
 
-from fmugym.declared.measuring import signal_of
 from fmugym.declared.resolved_task import ResolvedTask
 from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
@@ -69,7 +68,7 @@ class TaskEnv(FMUEnv):
         with root.placing():
             resolved = ResolvedTask(self.task, root, description, needs_reward)
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
-        self.inside.controllers, self.inside.signal_of = resolved.controllers, signal_of
+        self.inside.controllers = resolved.controllers
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
         self.unphysical_keys, self.expressions = resolved.unphysical_keys, resolved.expressions
         if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):

@@ -171,10 +171,9 @@ def _formulas_of(env: FMUEnv) -> Formulas:
     """
     for hook, key in _KEYS.items():
         if is_overridden(env, env.inside.base, hook):
-            name = type(env).__name__
             raise ConfigError(
-                f"{name} cannot be exported: its hook {hook} is a function of Python; write "
-                f"expressions under the key {key!r} instead"
+                f"{type(env).__name__} cannot be exported: its hook {hook} is a function of "
+                f"Python; write expressions under the key {key!r} instead"
             )
     return env.inside.formulas or Formulas(Graph(), None, (), None, None, None, None, {})
 

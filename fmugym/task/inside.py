@@ -101,8 +101,6 @@ class Inside:
             defaults of hooks call them.
         future: What a declared task reads of the future; None for other tasks.
         controllers: Makes the simple controllers of a declared task; None for other tasks.
-        signal_of: Of a declared task: makes a function of observations from an expression and the
-            names of their elements; None for other tasks.
         model: Makes an environment to plan with, where a plant stands in for the FMU; or None.
         held: Returns the outputs that a plant has not told now, whose last values go on.
         own: The hooks that the class has itself.
@@ -143,7 +141,6 @@ class Inside:
     formulas: Formulas | None
     future: Future | None
     controllers: Callable[[], list[Any]] | None
-    signal_of: Callable[[str, Sequence[str]], Callable[[Any], Any]] | None
     model: Callable[[], Any] | None
     held: Callable[[], Sequence[str]]
     halt: Callable[[], None]
@@ -194,7 +191,7 @@ class Inside:
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
         self.formulas, self.expressed, self.variable_starts = None, {}, {}
-        self.future = self.controllers = self.signal_of = self.model = None
+        self.future = self.controllers = self.model = None
         self.held = lambda: ()
         self.pictured = None, 0.0
         self.readings = NoReadings()  # type: ignore[assignment]  # until there are any

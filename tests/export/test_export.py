@@ -97,6 +97,28 @@ FILTERED = {
 """A pendulum with a filter and two actions, one of which is a gain."""
 
 
+class Shifted(fmugym.FMI2CSEnv):
+    """The same as a class, whose choices do not begin with 0."""
+
+    def __init__(self, **keys):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"theta_0": 0.5, "m": fmugym.Uniform(0.9, 1.1)},
+            "time_step": 0.05,
+            "max_episode_steps": 100,
+            "inputs": {"tau": "(0.5 if action[0] == 2 else action[0] - 2) * action[1]"},
+            "memory": {"slow": {"start": 0.0, "update": "0.9 * slow + 0.1 * q_dot"}},
+            "episode_variables": {"goal": fmugym.Uniform(-1, 1)},
+            "observations": ["q_dot", "slow", "sin(q) - goal", "cos(q)"],
+            "terminated": False,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config | keys)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.MultiDiscrete([3, 3], start=[2, -1])
+
+
 def heating(name):
     own = TASKS[name]
     variables = HEATING["variables"] | own.get("variables", {})
@@ -112,7 +134,7 @@ class Loops:
 
     @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House", "CloudPendulum"])
     def test_of_registered_tasks(self, env_id, tmp_path):
-        env = gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
+        env = made(env_id)
         network, language = network_for(env), self.languages[-1]
         agent = agent_of(env, network, all_inputs=True)
         measured, written, steps = closed_loop(
@@ -152,8 +174,9 @@ class Loops:
             assert worst <= 1e-5
         assert (len(began) > 1) == (times != "constant")
 
-    def test_of_several_choices(self, tmp_path, load):
-        env = load(FILTERED)
+    @pytest.mark.parametrize("make", [lambda: fmugym.load(FILTERED), Shifted])
+    def test_of_several_choices(self, make, tmp_path):
+        env = make()
         network = network_for(env)
         agent = agent_of(env, network)
         controller = exported(agent, tmp_path, self.languages[0])
@@ -166,7 +189,9 @@ class Loops:
             return chosen[-1]
 
         assert differences(env, act, agent.logic, controller.step, 50) == (0.0, 0.0, 50)
+        assert all(map(env.action_space.contains, chosen))
         assert len(np.unique(chosen, axis=0)) > 1
+        env.close()
 
 
 class TestClosedLoop(Loops):
@@ -301,6 +326,19 @@ class TestHooks:
     def test_others_are_refused(self, hooks, fact):
         odd = type("Odd", (Plain,), hooks)
         with closing(odd()) as env, pytest.raises(ConfigError, match=f"Odd.*{fact}"):
+            agent_of(env, network_for(env))
+
+    def test_of_a_task_that_has_a_reward_in_python(self):
+        class Rewarding(fmugym.TaskEnv):
+            def _reward_policy(self):
+                return -float(np.linalg.norm(self.state))
+
+        with closing(Rewarding(HEATING | {"agent": PRESENT})) as env:
+            assert [v.name for v in agent_of(env, network_for(env)).logic.measurements] == ["T_op"]
+
+    def test_the_end_of_an_episode_is_not_known_to_a_controller(self):
+        env = Shifted(observations=["1 if done else 0", "q"])
+        with closing(env), pytest.raises(ConfigError, match="'done'"):
             agent_of(env, network_for(env))
 
     def test_one_that_is_assigned_is_refused(self, load):

@@ -68,10 +68,10 @@ class TestClosedLoop:
             played = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         model = model_of(name, played)
         agent = agent_of(env, model)
-        measured, written, steps = closed_loop(played, predicting(model), agent, tmp_path)
+        measured, written, steps = closed_loop(played, predicting(model), agent, tmp_path, 700)
         assert measured <= 1e-4
         assert written <= 1e-4
-        assert steps == 200
+        assert steps == 700
         env.close()
 
     @pytest.mark.parametrize("name", DISCRETE)
@@ -124,7 +124,7 @@ class TestClosedLoop:
         env = made("Pendulum")
         model = model_of(name, env, use_sde=True)
         agent = agent_of(env, model)
-        measured, written, _ = closed_loop(env, predicting(model), agent, tmp_path)
+        measured, written, _ = closed_loop(env, predicting(model), agent, tmp_path, 700)
         assert measured <= 1e-4
         assert written <= 1e-4
         env.close()

@@ -8,9 +8,9 @@ import gymnasium
 import numpy as np
 import pytest
 from combinations import in_turn
-from export_tools import drawn_in, exported
+from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
-from test_export import HEATING, PRESENT, TASKS
+from test_export import HEATING, PRESENT, TASKS, Shifted
 from test_export_fmu import controller_of, sampling
 
 import fmugym
@@ -212,6 +212,15 @@ class Agents:
 
 class TestInC(Agents):
     language = "C99"
+
+    def test_of_several_choices(self, tmp_path):
+        env = Shifted()
+        agent = agent_for(env, None, HISTORY)
+        env.reset(seed=1)
+        controller = compiled(agent_of(env, agent), tmp_path, "C++")
+        controller.begin(goal=env.variables["goal"])
+        require_same(played(env, agent, controller.step), different=3)
+        env.close()
 
     def test_of_a_controller_in_python(self, tmp_path):
         env, texts = heater({"agent": PRESENT}), []

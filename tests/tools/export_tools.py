@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from contextlib import closing, contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium
@@ -17,7 +16,6 @@ from fmpy import extract, read_model_description
 from fmpy.simulation import apply_start_values, instantiate_fmu
 from gymnasium import spaces
 
-import fmugym
 from fmugym.export import Activation, Layer, Network, Scaling, agent_of, write_c, write_onnx
 
 FLAGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off")
@@ -69,16 +67,9 @@ TIMES = {
 """When its episodes begin."""
 
 
-ROOT = Path(__file__).parents[2]
-FILES = {"CartPole": "examples/cart_pole.toml", "Pendulum": "tests/golden/tasks/pendulum.toml"}
-"""Tasks that are those of registered environments."""
-
-
-def made(name):
-    """The environment of a task file, or a registered one without wrappers."""
-    if name in FILES:
-        return fmugym.load(ROOT / FILES[name])
-    return gymnasium.make(f"fmugym/{name}-v0").unwrapped
+def made(env_id):
+    """A registered environment without wrappers."""
+    return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
 
 
 def agent_named(name="agent", seed=0):
