@@ -25,7 +25,7 @@ from fmugym.export.external import found_in
 from fmugym.export.imperfections import without_imperfections
 from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.graph import Graph, Node
-from fmugym.expressions.program import UntraceableError
+from fmugym.expressions.program import UncompilableError
 from fmugym.expressions.value import Value
 from fmugym.task.inside import is_overridden
 from fmugym.vector.hooks.formula_programs import Translation, written_variables
@@ -151,7 +151,7 @@ def _logic_of_ideal(
     try:
         sample = _Sample(env, _formulas_of(env), decision)
         return _Assembly(env, sample, decision, all_inputs, external).logic()
-    except UntraceableError as error:
+    except UncompilableError as error:
         raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
 
 
@@ -217,7 +217,7 @@ class _Sample:
             self.updates[name] += (value.node,)
 
     def _row(self, *what: Any, dtype: Any = np.float64) -> Value:
-        return Value(self.graph, self.graph.load("row", what, dtype, None))
+        return Value(self.graph, self.graph.load("row", what, dtype))
 
     def _decided(
         self, observation: Sequence[Value]
@@ -352,7 +352,7 @@ class _Assembly:
         for place in places:
             variable = (interface.outputs + interface.monitors)[place]
             if variable.causality != "output":
-                raise UntraceableError(
+                raise UncompilableError(
                     f"it needs {variable.name!r}, which is no output of the FMU (its causality is "
                     f"{variable.causality!r}), so that no controller can measure it"
                 )
@@ -379,13 +379,13 @@ class _Assembly:
 
     def _output_node(self, place: int) -> int:
         """The node of a measurement, which the graph gets if it has none yet."""
-        return self._graph.load("row", ("output", place), np.float64, None).node
+        return self._graph.load("row", ("output", place), np.float64)
 
     def _first_inputs(self) -> list[float]:
         given = self._episode.parameters
         for name, _ in self._env.inside.start_inputs:
             if name in self._drawn:
-                raise UntraceableError(f"it reads the input {name!r}, whose first value is drawn")
+                raise UncompilableError(f"it reads the input {name!r}, whose first value is drawn")
         return [float(given.get(name, start)) for name, start in self._env.inside.start_inputs]
 
     def _add_actions(self, has_older: bool) -> None:
@@ -393,7 +393,7 @@ class _Assembly:
         dtype, first = np.dtype(space.dtype), np.ravel(self._env.inside.no_action)
         self._add("action", dtype, first.tolist(), self._sample.action)
         if has_older:
-            last = [self._graph.load("action", i, dtype, None).node for i in range(len(first))]
+            last = [self._graph.load("action", i, dtype) for i in range(len(first))]
             self._add("previous_action", dtype, first.tolist(), last)
 
     def _add_variable(self, name: str) -> None:
@@ -457,4 +457,4 @@ class _Assembly:
                 return "kept", self._fields[row[1]], 0
             case "parameter":
                 return "constant", float(self._episode.parameters[row[1]])
-        raise UntraceableError(f"it reads {row[0]!r}, which a controller does not have")
+        raise UncompilableError(f"it reads {row[0]!r}, which a controller does not have")

@@ -13,7 +13,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.onnx_nodes import Nodes
-from fmugym.expressions.graph import Cell, Graph, Node
+from fmugym.expressions.graph import Graph, Node
 from fmugym.expressions.program import letter_of, operation_of
 from fmugym.expressions.value import Value, where
 
@@ -150,11 +150,11 @@ class Operations:
         raise ConfigError(f"numpy.{name} of type {dtype} cannot be exported to ONNX")
 
     def _value(self, number: int) -> Value:
-        return Value(self._graph, Cell(number, None))
+        return Value(self._graph, number)
 
     def _named(self, name: str) -> Value:
         """A result of the model that the graph did not know."""
-        number = self._graph.load("node", name, np.float64, None).node
+        number = self._graph.load("node", name, np.float64)
         self._names[number] = name
         return self._value(number)
 

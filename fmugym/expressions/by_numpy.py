@@ -162,7 +162,7 @@ def _remainder(first: Any, second: Any) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """The function ``pow`` of C, of symbols too, which take a product for a constant exponent."""
+    """The function ``pow`` of C."""
     return np.float_power(*np.broadcast_arrays(base, exponent))[()]
 
 
@@ -170,8 +170,6 @@ def _power_of_float32(base: Any, exponent: Any) -> Any:
     """The function ``powf`` of C; numpy's loop over arrays may round otherwise."""
     operands = (np.float32(one) if isinstance(one, float) else one for one in (base, exponent))
     bases, exponents = np.broadcast_arrays(*operands)
-    if type(bases) is not np.ndarray:  # but symbols
-        return np.power(bases, exponents)
     pairs = zip(bases.flat, exponents.flat, strict=True)
     return np.array([one**other for one, other in pairs], np.float32).reshape(bases.shape)[()]
 

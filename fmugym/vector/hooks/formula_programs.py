@@ -10,9 +10,9 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.expressions.formulas import Formulas, Update
-from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.graph import Graph
 from fmugym.expressions.lowering import Store, compile_graph
-from fmugym.expressions.program import Program, UntraceableError, letter_of
+from fmugym.expressions.program import Program, UncompilableError, letter_of
 from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
 from fmugym.task.inside import is_overridden
@@ -44,10 +44,10 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
         formulas: What the task computes.
 
     Raises:
-        UntraceableError: If programs do not have its actions or observations, or it is too long.
+        UncompilableError: If programs do not have its actions or observations, or it is too long.
     """
     if env.inside.pool_tells:
-        raise UntraceableError("the pool tells infos of its own")
+        raise UncompilableError("the pool tells infos of its own")
     letter_of(np.dtype(env.action_space.dtype))
     judgement, seen, updated = _Judgement(env, formulas).made()
     types = dict.fromkeys(env.variables, _DOUBLE)
@@ -81,22 +81,22 @@ class Translation:
     ) -> None:
         self._env, self._graph, self._has_stepped = env, graph, has_stepped
         self._known = {} if known is None else known
-        self._cells: dict[int, Cell] = {}
+        self._nodes: dict[int, int] = {}
 
     def of(self, value: Value) -> Value:
         """The same value in the graph of the program."""
         source = value.graph
-        for number in source.needed([value.node], self._cells):
-            if number not in self._cells:
+        for number in source.needed([value.node], self._nodes):
+            if number not in self._nodes:
                 kind, what, operands, dtype = source.nodes[number]
                 if kind == "row":
-                    self._cells[number] = self._read(what).cast(dtype).cell
+                    self._nodes[number] = self._read(what).cast(dtype).node
                     continue
                 if kind in ("take", "interpolate"):
                     self._graph.tables[what] = source.tables[what]
-                cells = tuple(self._cells[one] for one in operands)
-                self._cells[number] = self._graph.add(kind, what, cells, dtype)
-        return Value(self._graph, self._cells[value.node])
+                own = tuple(self._nodes[one] for one in operands)
+                self._nodes[number] = self._graph.add(kind, what, own, dtype)
+        return Value(self._graph, self._nodes[value.node])
 
     def inputs(self, formulas: Formulas) -> list[Value]:
         """The FMU's inputs, each rounded to its type."""
@@ -109,11 +109,11 @@ class Translation:
         """The elements of the observation, in the type of their space.
 
         Raises:
-            UntraceableError: If the space is no array of numbers.
+            UncompilableError: If the space is no array of numbers.
         """
         space: Any = self._env.observation_space
         if not isinstance(space, spaces.Box | spaces.MultiBinary):
-            raise UntraceableError(f"programs make no observations of {space}")
+            raise UncompilableError(f"programs make no observations of {space}")
         if formulas.observation is None:
             count = self._env.inside.output_count
             elements = [self.quantity("outputs", place) for place in range(count)]
@@ -138,14 +138,14 @@ class Translation:
         return self._read((name, *keys))
 
     def _row(self, *what: Any, dtype: np.dtype[Any] = _DOUBLE) -> Value:
-        return Value(self._graph, self._graph.load("row", what, dtype, None))
+        return Value(self._graph, self._graph.load("row", what, dtype))
 
     def _loaded(self, attribute: str, index: int) -> Value:
         known = self._known.get((attribute, index))
         if known is not None:
             return known
         dtype = np.dtype(self._env.action_space.dtype)
-        return Value(self._graph, self._graph.load(attribute, index, dtype, None))
+        return Value(self._graph, self._graph.load(attribute, index, dtype))
 
     def _read(self, what: Any) -> Value:
         """What an environment has, see ``Value.read``."""
@@ -161,7 +161,7 @@ class Translation:
         quantity = QUANTITIES[name]
         kind = quantity.after if self._has_stepped else quantity.before
         if kind is None:
-            raise UntraceableError(f"it reads {name!r} before there is one")
+            raise UncompilableError(f"it reads {name!r} before there is one")
         place = keys.pop() if keys and isinstance(keys[-1], int) else 0
         return self._row(kind, *keys, place, dtype=quantity.dtype)
 
@@ -198,7 +198,7 @@ def written_variables(
             for place, one in enumerate(value):
                 written["variables", name, place] = values.of(one).number
     before = Translation(env, graph, True)
-    is_active = Value(graph, graph.load("active", None, _FLAG, None))
+    is_active = Value(graph, graph.load("active", None, _FLAG))
     return {key: where(is_active, value, before.quantity(*key)) for key, value in written.items()}
 
 
@@ -243,7 +243,7 @@ class _Judgement:
 
     def _told(self, kind: str) -> Value:
         """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
-        return Value(self._graph, self._graph.load(kind, None, _FLAG, None))
+        return Value(self._graph, self._graph.load(kind, None, _FLAG))
 
     def _update(self) -> tuple[list[Store], tuple[str, ...]]:
         """Write variables."""
