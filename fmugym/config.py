@@ -25,14 +25,20 @@ from fmugym.checks import (
 )
 from fmugym.distributions import Choice, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.expressions.language import Expression
 from fmugym.keys import (
     COUNT,
     LARGE_COUNT,
     NUMBER,
     POSITIVE,
+    REQUIRED,
     TEXT,
+    Either,
     Entries,
+    Key,
     Kind,
+    Listed,
+    Table,
     check_fields,
     checked,
     key,
@@ -49,9 +55,14 @@ from fmugym.pool.spec import (
     ResetMethod,
 )
 
-__all__ = ["CONFIG", "FOREIGN", "EnvConfig", "Foreign"]
+__all__ = ["CONFIG", "EXPRESSION", "FOREIGN", "EnvConfig", "Foreign"]
 
 ON_FAULT: Final = ("truncate", "terminate", "raise")
+_INFOS: Final = frozenset(
+    {"cost", "costs", "drawn", "fault", "fault_rate", "fmu_terminated", "reward_terms"}
+)
+"""What infos have of their own."""
+
 MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
 
@@ -132,6 +143,39 @@ def _start_time(what: str, value: Any) -> Any:
     given = Choice(value) if isinstance(value, list | tuple) else value
     return _number(what, as_distribution(what, given))
 
+
+def _expression(what: str, value: Any) -> Expression:
+    if isinstance(value, Expression):
+        return value
+    try:
+        return Expression.parse(value)
+    except ConfigError as error:
+        raise ConfigError(f"{what!r}: {error}") from None
+
+
+_EXPRESSION: Final = {"title": "expression", "type": ["number", "string", "boolean"]}
+
+EXPRESSION: Final = Kind(lambda _, value: Expression.parse(value), _EXPRESSION)
+"""An expression where the caller says in which key it stands."""
+
+_NAMED_EXPRESSION: Final = Kind(_expression, _EXPRESSION)
+
+_TERM: Final = Table(
+    {
+        "expr": Key(_NAMED_EXPRESSION, "The expression.", REQUIRED),
+        "weight": Key(NUMBER, "Factor of the reward.", 1.0),
+    },
+    what="key of a reward",
+    short="expr",
+)
+
+_REMEMBERED: Final = Table(
+    {
+        "start": Key(Kind(_variable), "Set, or drawn, at each reset.", REQUIRED),
+        "update": Key(_NAMED_EXPRESSION, "The value after each step.", REQUIRED),
+    },
+    what="key of 'memory'",
+)
 
 NAMES: Final = Kind(
     _names, {"title": "name, list of names", "type": ["string", "array"], "items": TEXT.schema}
@@ -276,6 +320,50 @@ class EnvConfig:
         "`_update` may write them; it assigns new arrays.",
         {},
     )
+    inputs: Mapping[str, Expression] = key(
+        Entries(_NAMED_EXPRESSION),
+        "[Expressions](class.md#expressions) by the names of inputs, which write them before each "
+        "step. The action has no elements for these inputs.",
+        {},
+    )
+    terminated: Expression | None = key(
+        _NAMED_EXPRESSION,
+        "A condition: the task has ended. Takes the place of `_is_done`.",
+        None,
+        "the hook `_is_done`",
+    )
+    truncated: Expression | None = key(
+        _NAMED_EXPRESSION,
+        "A condition: cut the episode short, in addition to `max_episode_steps`.",
+        None,
+        "never",
+    )
+    reward: Any = key(
+        Either(Entries(_TERM), _NAMED_EXPRESSION),
+        "An expression, or named ones that are added up, in the place of `positive_reward` and "
+        "`negative_reward`: `{name: expression}`, or `{name: {'expr': ..., 'weight': 0.1}}`. Terms "
+        "with names are in `info['reward_terms']`.",
+        None,
+        "`positive_reward` and `negative_reward`",
+    )
+    observations: Sequence[Expression] = key(
+        Listed(_NAMED_EXPRESSION, or_one=True),
+        "A list of expressions: the elements of the observation.",
+        (),
+        "the outputs",
+    )
+    memory: Mapping[str, Any] = key(
+        Entries(_REMEMBERED),
+        "Episode variables that expressions update after each step of the FMU: "
+        "`{name: {'start': 0, 'update': expression}}`.",
+        {},
+    )
+    costs: Mapping[str, Expression] = key(
+        Entries(_NAMED_EXPRESSION), "Expressions for `info['cost']`, by name.", {}
+    )
+    info: Mapping[str, Expression] = key(
+        Entries(_NAMED_EXPRESSION), "Expressions for more entries of `info`, by name.", {}
+    )
     bounds: Mapping[str, tuple[float, float]] = key(
         Entries(Kind(_bounds)),
         "`(low, high)` by name, used instead of the FMU's min and max: limits for the spaces, and "
@@ -355,11 +443,43 @@ class EnvConfig:
             return config
         if not isinstance(config, Mapping):
             raise ConfigError(f"config must be a dict, got {type(config).__name__}")
-        return cls(**checked(CONFIG, check_mapping("config", config)))
+        given = check_mapping("config", config)
+        for name in ("positive_reward", "negative_reward"):
+            if name in given and given.get("reward") is not None:
+                raise ConfigError(f"config keys 'reward' and {name!r} contradict each other")
+        return cls(**checked(CONFIG, given))
 
     def __post_init__(self) -> None:
         check_fields(self)
         self._check_names()
+
+    @property
+    def variable_starts(self) -> dict[str, Any]:
+        """What episode variables are at the beginning of an episode, the memory among them."""
+        return {name: one["start"] for name, one in self.memory.items()} | dict(
+            self.episode_variables
+        )
+
+    @property
+    def reward_terms(self) -> dict[str, dict[str, Any]]:
+        """The terms of the reward by name; one without a name has the name ``""``."""
+        if isinstance(self.reward, Expression):
+            return {"": {"expr": self.reward, "weight": 1.0}}
+        return dict(self.reward or {})
+
+    @property
+    def expressions(self) -> list[Expression]:
+        """All expressions."""
+        conditions = (self.terminated, self.truncated)
+        return [
+            *self.inputs.values(),
+            *(one for one in conditions if one is not None),
+            *(term["expr"] for term in self.reward_terms.values()),
+            *self.observations,
+            *(one["update"] for one in self.memory.values()),
+            *self.costs.values(),
+            *self.info.values(),
+        ]
 
     @property
     def draws_start_time(self) -> bool:
@@ -379,10 +499,17 @@ class EnvConfig:
                 Spellings("output", read).find(name) is None and "[" not in name
             ):  # an element of an array may be meant
                 raise unknown_name("output in 'samplings'", name, read)
-        for name in self.episode_variables:
+        self._check_names_of_task()
+
+    def _check_names_of_task(self) -> None:
+        for name in self.memory.keys() & self.episode_variables.keys():
+            raise ConfigError(f"{name!r} is in 'memory' and in 'episode_variables'")
+        for name in self.variable_starts:
             if name in self.model_parameters:
                 raise ConfigError(f"{name!r} is both a model parameter and an episode variable")
-        taken = "start_time" in {*self.model_parameters, *self.episode_variables}
+        for name in _INFOS & self.info.keys():
+            raise ConfigError(f"config key 'info': {name!r} has a meaning of its own in infos")
+        taken = "start_time" in {*self.model_parameters, *self.variable_starts}
         if taken and self.draws_start_time:
             raise ConfigError(
                 "'start_time' is the name of the start time that is drawn for each episode; no "

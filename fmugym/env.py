@@ -151,7 +151,7 @@ class FMUEnv(Constructed):
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
         self._construct(FMUEnv, fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
-        if self.inside.formulas[0] is not None:
+        if self.inside.formulas is not None:
             import_module(_PLAYERS)  # so that the first reset does not wait for it
 
     # Gymnasium's interface.
@@ -222,7 +222,7 @@ class FMUEnv(Constructed):
         inside = self.inside
         inside.has_chosen = True
         is_plain = not (inside.own.step or inside.own.reset) and pool.num_instances == 1
-        if inside.formulas[0] is not None and is_plain and pool.plays_alone:
+        if inside.formulas is not None and is_plain and pool.plays_alone:
             inside.player = import_module(_PLAYERS).player_of(self)
 
     def step(self, action: Any) -> Result:
@@ -392,8 +392,10 @@ class FMUEnv(Constructed):
     @property
     def observation_names(self) -> tuple[str, ...] | None:
         """The names of the observation's elements; None if a hook of the class makes it."""
-        is_default = type(self)._get_observation is FMUEnv._get_observation
-        return tuple(v.name for v in self.inside.interface.outputs) if is_default else None
+        if type(self)._get_observation is not FMUEnv._get_observation:
+            return None
+        expressions = tuple(one.text for one in self.config.observations)
+        return expressions or tuple(v.name for v in self.inside.interface.outputs)
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:

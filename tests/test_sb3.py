@@ -294,7 +294,7 @@ def test_methods_that_would_part_an_environment_from_the_others_are_refused(make
 def test_single_environments_that_are_real_ones_do_their_methods_themselves(make):
     class Slow(OneByOne):
         def widen(self):
-            self.x_threshold += 1
+            self.variables["x_threshold"] += 1
 
     venv = make(Slow)
     venv.reset()

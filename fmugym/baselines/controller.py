@@ -12,8 +12,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
+from fmugym.baselines.measuring import Formula, formula_of, of_rows
 from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.expressions.value import Value, where
 
 __all__ = [
     "Controller",
@@ -22,6 +24,8 @@ __all__ = [
     "Signal",
     "attribute_of",
     "check_numbers",
+    "either",
+    "limited",
     "require_physical",
 ]
 
@@ -31,11 +35,7 @@ Numbers = float | FloatArray
 """A number, or an array of shape (N,) with one for each environment."""
 
 Signal = str | Numbers
-"""An element of the observation by name, or a constant."""
-
-
-MakeSignal = Callable[[str, Sequence[str]], Callable[[Any], Any]]
-"""See ``Inside.signal_of``."""
+"""An element of the observation by name, an expression of them, or a constant."""
 
 
 class Controller(KnownArguments, ABC):
@@ -51,8 +51,7 @@ class Controller(KnownArguments, ABC):
     """
 
     is_physical: ClassVar[bool] = True
-    _make_signal: MakeSignal | None
-    _signals: dict[str, Callable[[Any], Any]]
+    _signals: dict[str, tuple[Formula, Callable[[Any], Any]]]
 
     space: spaces.Space[Any]
     names: tuple[str, ...]
@@ -81,7 +80,7 @@ class Controller(KnownArguments, ABC):
         self.space = env.single_action_space if self._is_vector else env.action_space
         self.time_step = attribute_of(env, "config").time_step
         self.names = self._names_of(env) if names is None else tuple(names)
-        self._make_signal, self._signals = _maker_of_signals(env), {}
+        self._signals = {}
         self._prepare()
         self.reset()
         return self
@@ -124,6 +123,27 @@ class Controller(KnownArguments, ABC):
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         """Forget the episodes of some environments."""
 
+    def decision(
+        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        """The formulas of a decision, of a controller of one environment.
+
+        Args:
+            observation: Its elements, as float64.
+            memory: The numbers that it remembers.
+
+        Returns:
+            The elements of the action, before they are limited, and the numbers that it remembers
+            then.
+
+        Raises:
+            ConfigError: If there are no such formulas.
+        """
+        raise ConfigError(
+            f"a controller of type {type(self).__name__} cannot be exported; a PID, a Hysteresis "
+            "and an LQR can be"
+        )
+
     def _names_of(self, env: Any) -> tuple[str, ...]:
         """The names of what the environment lets observe."""
         names: tuple[str, ...] | None = attribute_of(env, "observation_names")
@@ -150,20 +170,30 @@ class Controller(KnownArguments, ABC):
     def _column(self, rows: FloatArray, signal: Signal) -> FloatArray:
         """The values of a signal, shape (N,)."""
         if isinstance(signal, str):
-            signals: FloatArray = self._signals[signal](rows)
+            _, evaluate = self._signals[signal]
+            signals: FloatArray = evaluate(rows)
             return signals
         return np.full(len(rows), signal)
 
+    def _formula(self, observation: Sequence[Value], signal: Signal) -> Value:
+        """The value of a signal."""
+        if isinstance(signal, str):
+            formula, _ = self._signals[signal]
+            return formula(observation)
+        return observation[0].beside(signal)
+
     def _check_signal(self, what: str, signal: Signal) -> None:
-        """Check a signal; one that is no name may be an expression, if a task is declared."""
+        """Check a signal; one that is no name may be an expression."""
         if not isinstance(signal, str):
             self._check_size(what, check_numbers(what, signal))
-        elif self._make_signal is None or signal.isidentifier() or self._is_name(signal):
+        elif signal.isidentifier() or self._is_name(signal):
             self._check_name(what, signal)
-            self._signals[signal] = itemgetter((slice(None), self._place_of(signal)))
+            place = self._place_of(signal)
+            self._signals[signal] = itemgetter(place), itemgetter((slice(None), place))
         else:
             try:
-                self._signals[signal] = self._make_signal(signal, self.names)
+                formula = formula_of(signal, self.names)
+                self._signals[signal] = formula, of_rows(formula, len(self.names))
             except ConfigError as error:
                 raise ConfigError(f"{what}: {error}") from None
 
@@ -209,21 +239,38 @@ class Controller(KnownArguments, ABC):
             values = limited(values, space.low, space.high)
         return values.astype(space.dtype)
 
+    def action_of(self, values: Sequence[Value]) -> list[Value]:
+        """The elements of an action as ``act`` returns them: limited, and in the space's type.
+
+        Args:
+            values: The elements before that.
+        """
+        space: Any = self.space
+        if isinstance(space, spaces.Discrete):
+            values = [limited(np.rint(one), *self._limits()) for one in values]
+        elif isinstance(space, spaces.Box):
+            limits = zip(values, space.low.flat, space.high.flat, strict=True)
+            values = [limited(one, low, high) for one, low, high in limits]
+        return [one.cast(space.dtype) for one in values]
+
     def _shape(self) -> str:
         width = len(self.names)
         return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
 
 
-def _maker_of_signals(env: Any) -> MakeSignal | None:
-    """See ``Inside.signal_of``; None for what is no environment."""
-    is_env = hasattr(env.unwrapped, "inside")
-    make: MakeSignal | None = attribute_of(env, "inside").signal_of if is_env else None
-    return make
-
-
 def limited(values: Any, low: Any, high: Any) -> Any:
-    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers."""
+    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers.
+
+    Formulas are limited alike.
+    """
     return np.minimum(np.maximum(values, low), high)
+
+
+def either(condition: Any, first: Any, second: Any) -> Any:
+    """Do what ``numpy.where`` does, of formulas, too."""
+    if isinstance(condition, Value):
+        return where(condition, first, second)
+    return np.where(condition, first, second)
 
 
 def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:

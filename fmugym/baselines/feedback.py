@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,11 @@ from fmugym.baselines.controller import (
     Numbers,
     Signal,
     check_numbers,
+    either,
     limited,
 )
 from fmugym.errors import ConfigError
+from fmugym.expressions.value import Value
 from fmugym.extras import imported
 from fmugym.linearization import LinearModel
 from fmugym.linearization.trajectories import discrete
@@ -40,7 +44,7 @@ class Law(Controller):
 
     @abstractmethod
     def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
-        """Compute the action, before it is limited; element by element.
+        """Compute the action, before it is limited: of arrays element by element, or of formulas.
 
         Args:
             value: What is measured.
@@ -51,10 +55,13 @@ class Law(Controller):
             The action, and what the controller remembers then.
         """
 
-    def step(self, rows: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
-        """Do what ``law`` does, for observations of shape (N, k)."""
-        value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
-        return self.law(value, setpoint, state)
+    def decision(
+        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        """See ``Controller.decision``."""
+        value, setpoint = (self._formula(observation, one) for one in (self.of, self.setpoint))
+        action, state = self.law(value, setpoint, memory)
+        return [action], state
 
     def _prepare(self) -> None:
         self._check_signal("of", self.of)
@@ -67,7 +74,8 @@ class Law(Controller):
 
     def _decide(self, rows: FloatArray) -> FloatArray:
         action: FloatArray
-        action, self._state = self.step(rows, self._state)
+        value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
+        action, self._state = self.law(value, setpoint, self._state)
         return action
 
 
@@ -101,8 +109,8 @@ class Hysteresis(Law):
     def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
         """See ``Law.law``; the controller remembers its action."""
         error = value - setpoint
-        kept = np.where(error > self.band, self.above, state[0])
-        action = np.where(error < -self.band, self.below, kept)
+        kept = either(error > self.band, self.above, state[0])
+        action = either(error < -self.band, self.below, kept)
         return action, (action,)
 
 
@@ -155,14 +163,14 @@ class PID(Law):
         """See ``Law.law``; the controller remembers the integral and the last value."""
         integral, last = state
         error = setpoint - value
-        change = np.where(np.isnan(last), 0.0, value - last)
+        change = either(last != last, 0.0, value - last)  # it is NaN in the first step
         rest = self.offset + self.kp * (error - self.td * change / self.time_step)
         if self.ti is None:
             return rest, (integral, value)
         growth = self.kp * error * self.time_step / self.ti
         wanted = rest + integral + growth
         beyond = wanted - limited(wanted, self._low, self._high)
-        integral = np.where(beyond * growth > 0, integral, integral + growth)
+        integral = either(beyond * growth > 0, integral, integral + growth)
         return rest + integral, (integral, value)
 
 
@@ -207,6 +215,16 @@ class LQR(Controller):
         if np.abs(np.linalg.eigvals(a - b @ self.gain)).max() >= 1:
             raise ConfigError("no regulator stabilizes this model; do its inputs move its states?")
         self._places = [self._place_of(name) for name in self.of]
+
+    def decision(
+        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        """See ``Controller.decision``."""
+        pairs = zip(self._places, self.model.x0, strict=True)
+        deviation = [observation[place] - start for place, start in pairs]
+        products = [[k * one for k, one in zip(row, deviation, strict=True)] for row in self.gain]
+        pairs = zip(self.model.u0, products, strict=True)
+        return [start - reduce(add, parts) for start, parts in pairs], []
 
     def _decide(self, rows: FloatArray) -> FloatArray:
         deviation = rows[:, self._places] - self.model.x0

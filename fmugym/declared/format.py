@@ -22,7 +22,7 @@ from fmugym.checks import (
     duration,
     integer_of,
 )
-from fmugym.config import CONFIG, FOREIGN
+from fmugym.config import CONFIG, EXPRESSION, FOREIGN
 from fmugym.declared.dates import moment_of_year, zone_of
 from fmugym.declared.numbers import constant_of, finite, number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
@@ -248,9 +248,6 @@ POSITIVE: Final = Kind(_within(number, positive=True), {**_NUMERIC, "title": "po
 TIME: Final = Kind(_time, _TIME)
 POSITIVE_TIME: Final = Kind(_within(_time, positive=True), {**_TIME, "title": "positive time"})
 DEVIATION: Final = Kind(_within(number, minimum=0), {**_NUMERIC, "title": "number from 0 on"})
-EXPRESSION: Final = Kind(
-    lambda _, value: Expression.parse(value), {**_NUMERIC, "title": "expression"}
-)
 DRAWN: Final = Kind(number_or_distribution, _DRAWN)
 TIME_OR_DRAWN: Final = Kind(
     partial(number_or_distribution, read=_time), {**_DRAWN, "title": "time, distribution"}
@@ -866,6 +863,12 @@ _OF_SECTIONS: Final = {
     "max_episode_steps": "it follows from 'episode_length', which stands above [config]",
     "positive_reward": "give an expression for 'reward'",
     "negative_reward": "give an expression for 'reward'",
+    "observations": "name them in 'observations' of [agent]",
+    "info": "name the figure in [kpis]",
+    **dict.fromkeys(
+        ("inputs", "terminated", "truncated", "reward", "memory", "costs"),
+        "it stands above [config]",
+    ),
 }
 """Keys of a config that other sections of a task determine, and how."""
 

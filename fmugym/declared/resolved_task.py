@@ -76,8 +76,8 @@ class ResolvedTask:
     Attributes:
         config: The config for ``FMUEnv``.
         formulas: What the task computes.
-        hooks: Functions of the environment by the names of the hooks that they are; most of them
-            evaluate formulas.
+        hooks: Functions of the environment by the names of the hooks that they are, for spaces and
+            for what is said of rewards.
         observation_names: The names of the elements of the observation.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if the actions have no levels.
@@ -122,7 +122,7 @@ class ResolvedTask:
         declared = self._declared
         self.config = self._make_config()
         self.formulas = self._make_formulas()
-        self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
+        self.hooks = self._hooks_of_spaces() | self._hooks_of_rewards()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
         self.warm_up = self._make_warm_up() if self._naming.warm_steps else None
         self.action_masks = self._action_masks()
@@ -273,13 +273,9 @@ class ResolvedTask:
         hooks: dict[str, Hook] = {}
         actions, seen, formulas = self._action_space(), self._observation_space(), self.formulas
         if formulas.inputs is not None:
-            values = formulas.inputs
             hooks["_get_action_space"] = lambda env: actions
-            hooks["_get_inputs"] = function_of(values[0] if len(values) == 1 else values)
         if formulas.observation is not None:
             hooks["_get_observation_space"] = lambda env: seen
-            observe = function_of(formulas.observation)
-            hooks["_get_observation"] = lambda env: np.array(observe(env), dtype=np.float32)
         return hooks
 
     def _action_space(self) -> spaces.Space[Any] | None:
@@ -378,6 +374,7 @@ class ResolvedTask:
             self._updated_kpis,
         ]
         return Formulas(
+            self._naming.graph,
             None if self._action_space() is None else self._input_values(),
             [update for update in updates if update],
             self._condition("terminated") if "terminated" in declared.flags else None,
@@ -387,22 +384,12 @@ class ResolvedTask:
             self._info() if has_info else {},
         )
 
-    def _hooks_of_steps(self) -> dict[str, Hook]:
-        formulas, rewards = self.formulas, self._declared.rewards
-        hooks: dict[str, Hook] = {}
-        if formulas.updates:
-            hooks["_update"] = update_by(formulas.updates)
-        if formulas.terminated is not None:
-            hooks["_is_done"] = function_of(formulas.terminated)
-        if formulas.truncated is not None:
-            hooks["_is_truncated"] = function_of(formulas.truncated)
-        if formulas.reward is not None:
-            hooks["_reward_policy"] = function_of(formulas.reward)
-            hooks["_explain"] = explanation(rewards, self._terms(rewards), self._naming)
-            hooks["_fault_reward"] = self._fault_reward()
-        if formulas.info:
-            hooks["_get_info"] = function_of(formulas.info)
-        return hooks
+    def _hooks_of_rewards(self) -> dict[str, Hook]:
+        rewards = self._declared.rewards
+        if not rewards:
+            return {}
+        explain = explanation(rewards, self._terms(rewards), self._naming)
+        return {"_explain": explain, "_fault_reward": self._fault_reward()}
 
     def _updates_of_histories(self) -> list[Update]:
         """The sensors follow what they measure."""

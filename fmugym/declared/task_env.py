@@ -6,13 +6,11 @@ import logging
 from types import MethodType
 from typing import Any, Final, Never
 
-from fmugym.declared.measuring import signal_of
 from fmugym.declared.resolved_task import ResolvedTask
 from fmugym.declared.task import Task
 from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
-from fmugym.task.step import ORDER
 
 __all__ = ["TaskEnv"]
 
@@ -20,11 +18,6 @@ __all__ = ["TaskEnv"]
 _ARGUMENTS: Final = (
     *("config", "log_level", "render_mode", "backend", "isolation", "master", "scenario"),
 )
-
-_NOT_DECLARED: Final = frozenset(
-    {*ORDER, "step", "reset", "_get_action_space", "_get_observation_space", "_goal_reward"}
-)
-"""What a class may have of its own, so that hooks are more than the formulas of the task."""
 
 
 class TaskEnv(FMUEnv):
@@ -55,8 +48,6 @@ class TaskEnv(FMUEnv):
         FMULoadError: If the FMU cannot be used on this machine.
     """
 
-    vectorized = True  # the default of ``_is_done`` here
-
     def __init__(
         self,
         config: Any,
@@ -77,7 +68,7 @@ class TaskEnv(FMUEnv):
         with root.placing():
             resolved = ResolvedTask(self.task, root, description, needs_reward)
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
-        self.inside.controllers, self.inside.signal_of = resolved.controllers, signal_of
+        self.inside.controllers = resolved.controllers
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
         self.unphysical_keys, self.expressions = resolved.unphysical_keys, resolved.expressions
         if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
@@ -88,14 +79,10 @@ class TaskEnv(FMUEnv):
         self._observation_names, self._masks = resolved.observation_names, resolved.action_masks
         own = _own_hooks(type(self))
         own |= {"_explain"} if "_reward_policy" in own else set()
-        functions = {
-            name: MethodType(function, self)
-            for name, function in resolved.hooks.items()
-            if name not in own
-        }
-        for name, function in functions.items():
-            setattr(self, name, function)
-        self.inside.formulas = None if own & _NOT_DECLARED else resolved.formulas, functions
+        for name, function in resolved.hooks.items():
+            if name not in own:
+                setattr(self, name, MethodType(function, self))
+        self.inside.formulas = resolved.formulas
         with self.task.root.placing():
             super().__init__(
                 source,
@@ -126,10 +113,6 @@ class TaskEnv(FMUEnv):
         if self._masks is None:
             raise ConfigError("action_masks needs actions with 'levels'")
         return self._masks(self)
-
-    def _is_done(self) -> Any:
-        """Episodes of a task that says nothing about their end are only truncated."""
-        return False
 
 
 def _own_hooks(cls: type[TaskEnv]) -> set[str]:

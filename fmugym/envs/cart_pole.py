@@ -11,9 +11,10 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.bundled import bundled_fmu
-from fmugym.checks import check_flag, check_mapping
+from fmugym.checks import check_flag
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
+from fmugym.envs.task_numbers import TaskNumber, largest, with_task_numbers
 from fmugym.rendering import CartPoleFrame, CartPoleScene
 
 __all__ = ["CartPoleEnv"]
@@ -31,6 +32,14 @@ _GYMNASIUM_PLANT = {
     "solver": "explicit_euler",
     "max_step": 1.0,
 }
+
+
+_NUMBERS = {
+    "force_mag": 10.0,
+    "x_threshold": 2.4,
+    "theta_threshold_radians": 12 * 2 * math.pi / 360,
+}
+"""Numbers of the task: the force in N, and the limits in m and rad."""
 
 
 class CartPoleEnv(FMUEnv):
@@ -78,7 +87,8 @@ class CartPoleEnv(FMUEnv):
     ## Arguments
     * ``sutton_barto_reward``: see above.
     * ``fmi_version``: which FMU to use: "1.0", "2.0" (default) or "3.0".
-    * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
+    * ``model_parameters``: values or distributions that override those of Gymnasium's plant, or
+      the task's ``force_mag`` [N], ``x_threshold`` [m] and ``theta_threshold_radians``.
     * ``render_mode``: "human", "rgb_array" or None.
     * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
@@ -87,9 +97,10 @@ class CartPoleEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
-    vectorized = True
     steps_after_end: ClassVar[bool] = True
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "low", "high")
+
+    force_mag, x_threshold, theta_threshold_radians = TaskNumber(), TaskNumber(), TaskNumber()
 
     def __init__(
         self,
@@ -101,21 +112,19 @@ class CartPoleEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        self.sutton_barto_reward = check_flag("sutton_barto_reward", sutton_barto_reward)
+        is_sutton_barto = check_flag("sutton_barto_reward", sutton_barto_reward)
         given = {} if model_parameters is None else model_parameters
-        self.force_mag = 10.0
-        self.x_threshold = 2.4
-        self.theta_threshold_radians = 12 * 2 * math.pi / 360
+        parameters, numbers = with_task_numbers(_NUMBERS, given)
         start = {name: Uniform(-0.05, 0.05) for name in START_VALUES}
         config = {
             "model_input_names": "f",
             "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
-            "model_parameters": {
-                **start,
-                **_GYMNASIUM_PLANT,
-                **check_mapping("model_parameters", given),
-            },
+            "model_parameters": {**start, **_GYMNASIUM_PLANT, **parameters},
+            "episode_variables": numbers,
             "time_step": 0.02,
+            "inputs": {"f": "force_mag * (2 * action - 1)"},
+            "terminated": "abs(x) > x_threshold or abs(phi) > theta_threshold_radians",
+            "reward": "0 - done" if is_sutton_barto else "1 - (done and after_end)",
         }
         fmu_path = bundled_fmu("CartPole", fmi_version)
         super().__init__(fmu_path, config, log_level, render_mode=render_mode, **options)
@@ -124,8 +133,11 @@ class CartPoleEnv(FMUEnv):
         return spaces.Discrete(2)
 
     def _get_observation_space(self) -> spaces.Space[Any]:
-        limits = [2 * self.x_threshold, math.inf, 2 * self.theta_threshold_radians, math.inf]
-        high = np.array(limits, dtype=np.float32)
+        numbers = self.config.episode_variables
+        x, theta = (
+            2 * largest(numbers[name]) for name in ("x_threshold", "theta_threshold_radians")
+        )
+        high = np.array([x, math.inf, theta, math.inf], dtype=np.float32)
         return spaces.Box(-high, high, dtype=np.float32)
 
     def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -134,18 +146,6 @@ class CartPoleEnv(FMUEnv):
             start = Uniform(options.get("low", -0.05), options.get("high", 0.05))
             parameters |= dict.fromkeys(START_VALUES, start)
         return parameters
-
-    def _get_inputs(self) -> Any:
-        return self.force_mag * (2.0 * self.action - 1.0)
-
-    def _is_done(self) -> Any:
-        x, _, theta, _ = self.state
-        return (abs(x) > self.x_threshold) | (abs(theta) > self.theta_threshold_radians)
-
-    def _reward_policy(self) -> Any:
-        if self.sutton_barto_reward:
-            return 0.0 - self.done
-        return 1.0 - (self.done & self.after_end)
 
     def _get_scene(self) -> CartPoleScene:
         return CartPoleScene(self.x_threshold, 1.0, self.theta_threshold_radians)

@@ -15,6 +15,7 @@ from fmugym.checks import check_mapping, number_of
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.envs.cells import paced_cells
+from fmugym.envs.task_numbers import TaskNumber
 from fmugym.errors import ConfigError
 from fmugym.rendering import PendulumFrame, PendulumScene
 
@@ -113,8 +114,9 @@ class CloudPendulumEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
-    vectorized = True
     render_size: ClassVar[tuple[int, int]] = (500, 500)
+
+    torque_limit, limit_penalty = TaskNumber(), TaskNumber()
 
     def __init__(
         self,
@@ -131,13 +133,11 @@ class CloudPendulumEnv(FMUEnv):
         log_level: int = logging.WARNING,
         **options: Any,
     ) -> None:
-        self.torque_limit = number_of("torque_limit", torque_limit)
-        if not 0.0 < self.torque_limit <= PLATFORM_TORQUE:
+        limit = number_of("torque_limit", torque_limit)
+        if not 0.0 < limit <= PLATFORM_TORQUE:
             raise ConfigError(
-                f"torque_limit must be more than 0 and at most {PLATFORM_TORQUE} N m, "
-                f"got {self.torque_limit}"
+                f"torque_limit must be more than 0 and at most {PLATFORM_TORQUE} N m, got {limit}"
             )
-        self.limit_penalty = 1000.0
         self._in_lab = not isinstance(backend, str) or backend == "lab"  # an error will say how
         given = {} if model_parameters is None else model_parameters
         given = check_mapping("model_parameters", given)
@@ -145,11 +145,28 @@ class CloudPendulumEnv(FMUEnv):
         if self._in_lab:
             backend = paced_cells(backend, user_token, gym_token, gym_time, session_time)
         plant = {} if self._in_lab else _FMU_PARAMETERS
+        chosen = "clip(action[0], -1, 1)"
+        torque = f"torque_limit * {chosen}"  # in the lab, the cells wait for the tick
+        if not self._in_lab:  # the product with 0 refuses a NaN at once
+            torque = f"torque_limit * clip(previous(action[0]), -1, 1) + 0 * {torque}"
+        velocity = f"{_VELOCITY_WEIGHT} * previous(q_dot)**2"
+        effort = f"{_EFFORT_WEIGHT} * (torque_limit * {chosen} / torque_limit)**2"
+        cost = f"(previous(q) % (2 * pi) - pi)**2 + {velocity} + {effort}"
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
             "model_parameters": {"q_0": Uniform(-0.05, 0.05), **plant, **given},
+            "episode_variables": {"torque_limit": limit, "limit_penalty": 1000.0},
             "time_step": TIME_STEP,
+            "inputs": {"tau": torque},
+            "terminated": f"abs(q) > {POSITION_LIMIT} or abs(q_dot) > {VELOCITY_LIMIT}",
+            "reward": f"-({cost}) - limit_penalty * done",
+            "observations": [
+                "cos(q)",
+                "sin(q)",
+                f"clip(q_dot, -{VELOCITY_LIMIT}, {VELOCITY_LIMIT})",
+            ],
+            "info": {} if self._in_lab else {"sample_age": 0},
         }
         super().__init__(
             bundled_fmu("Pendulum", fmi_version),
@@ -181,40 +198,15 @@ class CloudPendulumEnv(FMUEnv):
         self._require_settable(parameters)
         return parameters
 
-    def _get_inputs(self) -> Any:
-        """Delay the torque by a step on the FMU; in the lab the cells wait for the tick."""
-        torque = self._torque(self.action)
-        if self._in_lab:
-            return torque
-        return self._torque(self.previous_action) + 0.0 * torque  # which refuses a NaN at once
-
-    def _torque(self, action: Any) -> Any:
-        return self.torque_limit * np.float64(np.minimum(np.maximum(action[0], -1.0), 1.0))
-
-    def _is_done(self) -> Any:
-        q, q_dot = self.state
-        return (abs(q) > POSITION_LIMIT) | (abs(q_dot) > VELOCITY_LIMIT)
-
-    def _reward_policy(self) -> Any:
-        q, q_dot = self.previous_state
-        theta = q % math.tau - math.pi
-        effort = (self._torque(self.action) / self.torque_limit) ** 2
-        cost = theta**2 + _VELOCITY_WEIGHT * q_dot**2 + _EFFORT_WEIGHT * effort
-        return -cost - self.limit_penalty * self.done
-
-    def _get_observation(self) -> Any:
-        q, q_dot = self.state
-        limited = np.minimum(np.maximum(q_dot, -VELOCITY_LIMIT), VELOCITY_LIMIT)
-        return np.array([np.cos(q), np.sin(q), limited], dtype=np.float32)
-
-    def _get_info(self) -> dict[str, Any]:
-        return {} if self._in_lab else {"sample_age": np.zeros(np.shape(self.state[0]))[()]}
-
     def _get_scene(self) -> PendulumScene:
         return PendulumScene(torque_limit=self.torque_limit)
 
     def _get_frame(self) -> PendulumFrame:
-        return PendulumFrame(self.state[0] - math.pi, self._torque(self.previous_action))
+        return PendulumFrame(self.state[0] - math.pi, self._present_torque())
 
     def _describe_action(self) -> str:
-        return f"{self._torque(self.previous_action):+.3f} N m"
+        return f"{self._present_torque():+.3f} N m"
+
+    def _present_torque(self) -> float:
+        """The torque of the action before, which acts now, in N m."""
+        return float(self.torque_limit * np.clip(self.previous_action[0], -1.0, 1.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
@@ -13,12 +13,17 @@ from gymnasium import spaces
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.checks import check_number
 from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMUEnv
+from fmugym.envs.task_numbers import TaskNumber
 from fmugym.rendering import CartPoleFrame, CartPoleScene
 
 __all__ = ["DymolaCSCartPoleEnv", "JModelicaCSCartPoleEnv", "ModelicaCartPoleEnv"]
 
 THETA_0 = math.radians(85)
 """Lean of the pole at the start, from the positive x-axis, in rad."""
+
+
+_NUMBERS: Final = {"x_threshold": 2.4, "theta_threshold": math.radians(12)}
+"""The limits of the task in m and rad."""
 
 
 class ModelicaCartPoleEnv(FMUEnv):
@@ -74,7 +79,8 @@ class ModelicaCartPoleEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
-    vectorized = True
+
+    force, x_threshold, theta_threshold = TaskNumber(), TaskNumber(), TaskNumber()
 
     def __init__(
         self,
@@ -94,15 +100,17 @@ class ModelicaCartPoleEnv(FMUEnv):
         **options: Any,
     ) -> None:
         names = self._variable_names(own_fmu=fmu_path is not None)
-        self.force = check_number("force", force)
-        self.x_threshold = 2.4
-        self.theta_threshold = math.radians(12)
+        numbers = {"force": check_number("force", force), **_NUMBERS}
+        x, _, theta, _ = names["outputs"]
         parameters = (m_cart, m_pole, theta_0, theta_dot_0)
         config = {
             "model_input_names": names["input"],
             "model_output_names": names["outputs"],
             "model_parameters": dict(zip(names["parameters"], parameters, strict=True)),
+            "episode_variables": numbers,
             "time_step": time_step,
+            "inputs": {names["input"]: "force * (2 * action - 1)"},
+            "terminated": f"abs({x}) > x_threshold or abs({theta} - pi / 2) > theta_threshold",
             "positive_reward": positive_reward,
             "negative_reward": negative_reward,
         }
@@ -122,16 +130,10 @@ class ModelicaCartPoleEnv(FMUEnv):
 
     def _get_observation_space(self) -> spaces.Space[Any]:
         centre = np.array([0.0, 0.0, np.pi / 2, 0.0])
-        reach = np.array([2 * self.x_threshold, np.inf, 2 * self.theta_threshold, np.inf])
+        x, theta = _NUMBERS["x_threshold"], _NUMBERS["theta_threshold"]
+        reach = np.array([2 * x, np.inf, 2 * theta, np.inf])
         low, high = (centre - reach).astype(np.float32), (centre + reach).astype(np.float32)
         return spaces.Box(low, high, dtype=np.float32)
-
-    def _get_inputs(self) -> Any:
-        return self.force * (2.0 * self.action - 1.0)
-
-    def _is_done(self) -> Any:
-        x, _, theta, _ = self.state
-        return (abs(x) > self.x_threshold) | (abs(theta - np.pi / 2) > self.theta_threshold)
 
     def _get_scene(self) -> CartPoleScene:
         return CartPoleScene(self.x_threshold, 1.0, self.theta_threshold, self.force)

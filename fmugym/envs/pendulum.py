@@ -10,9 +10,9 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.bundled import bundled_fmu
-from fmugym.checks import check_mapping
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
+from fmugym.envs.task_numbers import TaskNumber, largest, with_task_numbers
 from fmugym.rendering import PendulumFrame, PendulumScene
 
 __all__ = ["PendulumEnv"]
@@ -28,6 +28,14 @@ _GYMNASIUM_PLANT = {
     "solver": "semi_implicit_euler",
     "max_step": 1.0,
 }
+
+
+_NUMBERS = {"max_speed": 8.0, "max_torque": 2.0}
+"""Numbers of the task: the limits of the observation in rad/s, and of the torque in N m."""
+
+_TORQUE = "clip(action[0], -max_torque, max_torque)"
+
+_ANGLE = "((previous(theta) + pi) % (2 * pi) - pi)"
 
 
 class PendulumEnv(FMUEnv):
@@ -70,7 +78,8 @@ class PendulumEnv(FMUEnv):
     ## Arguments
     * ``g``: acceleration of gravity in m/s^2, by default 10.
     * ``fmi_version``: which FMU to use: "1.0", "2.0" (default) or "3.0".
-    * ``model_parameters``: values or distributions that override those of Gymnasium's plant.
+    * ``model_parameters``: values or distributions that override those of Gymnasium's plant, or
+      the task's ``max_torque`` [N m] and ``max_speed`` [rad/s].
     * ``render_mode``: "human", "rgb_array" or None.
     * ``options``: more arguments of ``FMUEnv``, such as ``isolation``.
 
@@ -79,10 +88,11 @@ class PendulumEnv(FMUEnv):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012  (see FMUEnv)
-    vectorized = True
     steps_after_end: ClassVar[bool] = True
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters", "x_init", "y_init")
     render_size: ClassVar[tuple[int, int]] = (500, 500)
+
+    max_speed, max_torque = TaskNumber(), TaskNumber()
 
     def __init__(
         self,
@@ -95,29 +105,32 @@ class PendulumEnv(FMUEnv):
         **options: Any,
     ) -> None:
         given = {} if model_parameters is None else model_parameters
-        self.max_speed = 8.0
-        self.max_torque = 2.0
+        parameters, numbers = with_task_numbers(_NUMBERS, given)
         start = {"theta_0": Uniform(-np.pi, np.pi), "theta_dot_0": Uniform(-1.0, 1.0)}
+        # Gymnasium rounds 3 * u to float32. The FMU computes 3 / (m l^2) * tau in float64: three
+        # times a third of a float64 is exact. Its squares are those of the functions of C.
+        effort = f"float32(float32(0.001) * powf({_TORQUE}, 2))"
         config = {
             "model_input_names": "tau",
             "model_output_names": ["theta", "theta_dot"],
-            "model_parameters": {
-                **start,
-                **_GYMNASIUM_PLANT,
-                "g": g,
-                **check_mapping("model_parameters", given),
-            },
+            "model_parameters": {**start, **_GYMNASIUM_PLANT, "g": g, **parameters},
+            "episode_variables": numbers,
             "time_step": 0.05,
+            "inputs": {"tau": f"float32(3 * {_TORQUE}) / 3"},
+            "terminated": False,
+            "reward": f"-(pow({_ANGLE}, 2) + 0.1 * pow(previous(theta_dot), 2) + {effort})",
+            "observations": ["cos(theta)", "sin(theta)", "theta_dot"],
         }
         fmu_path = bundled_fmu("Pendulum", fmi_version)
         super().__init__(fmu_path, config, log_level, render_mode=render_mode, **options)
 
     def _get_action_space(self) -> spaces.Space[Any]:
-        limit = self.max_torque
+        limit = largest(self.config.episode_variables["max_torque"])
         return spaces.Box(-limit, limit, shape=(1,), dtype=np.float32)
 
     def _get_observation_space(self) -> spaces.Space[Any]:
-        high = np.array([1.0, 1.0, self.max_speed], dtype=np.float32)
+        max_speed = largest(self.config.episode_variables["max_speed"])
+        high = np.array([1.0, 1.0, max_speed], dtype=np.float32)
         return spaces.Box(-high, high, dtype=np.float32)
 
     def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -128,32 +141,6 @@ class PendulumEnv(FMUEnv):
                 parameters[name] = Uniform(-limit, limit)
         return parameters
 
-    def _clipped_torque(self) -> Any:
-        """The torque in the type of the action, float32 for elements of the action space."""
-        return np.minimum(np.maximum(self.action[0], -self.max_torque), self.max_torque)
-
-    def _get_inputs(self) -> Any:
-        """Return the torque that makes the FMU's product equal Gymnasium's ``3 * u``.
-
-        Gymnasium rounds ``3 * u`` to float32. The FMU computes ``3 / (m l^2) * tau`` in float64, so
-        that a third of the rounded product is the right ``tau``: three times a third of a float64
-        is exact.
-        """
-        return np.float64(3.0 * self._clipped_torque()) / 3.0
-
-    def _is_done(self) -> Any:
-        return self.state[0] != self.state[0]  # False, in the shape of the state
-
-    def _reward_policy(self) -> Any:
-        theta, theta_dot = self.previous_state
-        angle = ((theta + np.pi) % (2 * np.pi)) - np.pi
-        effort = np.float64(0.001 * _squared(self._clipped_torque()))  # rounded as the action is
-        return -(_squared(angle) + 0.1 * _squared(theta_dot) + effort)
-
-    def _get_observation(self) -> Any:
-        theta, theta_dot = self.state
-        return np.array([np.cos(theta), np.sin(theta), theta_dot], dtype=np.float32)
-
     def _get_scene(self) -> PendulumScene:
         return PendulumScene(torque_limit=self.max_torque)
 
@@ -162,18 +149,3 @@ class PendulumEnv(FMUEnv):
 
     def _describe_action(self) -> str:
         return f"{self.inputs[0]:+.2f} N m"
-
-
-def _squared(value: Any) -> Any:
-    """Square by the C library's ``pow``, as Gymnasium does; a product differs in a bit at times.
-
-    ``**`` multiplies arrays. Of float64, ``numpy.float_power`` comes nearest, as ``numpy.power``
-    has loops of its own on some processors, which are slow where a number is negative; of float32,
-    ``numpy.float_power`` would round in another way.
-    """
-    if not isinstance(value, np.ndarray):
-        return value**2
-    two = np.full_like(value, 2.0)
-    if value.dtype == np.float32:
-        return np.power(np.abs(value), two)
-    return np.float_power(value, two)

@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 
 from fmugym.baselines.controller import Controller
 from fmugym.baselines.feedback import Law
@@ -17,6 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.network import Activation, Layer, Network, Scaling
 from fmugym.export.policies import network_of_model
+from fmugym.expressions.value import Value
 from fmugym.scaling import are_scaled
 from fmugym.search.policy import LIMIT, Agent, Policy
 
@@ -25,10 +25,11 @@ __all__ = ["Decision", "decision_of"]
 _MEMORY: Final = ("agent.last_observation", "agent.leaky_integral", "agent.last_action")
 _CONTROLLER: Final = "agent.controller"
 
-_Ask = Callable[[Any], Any]
+_Ask = Callable[[Sequence[Value]], Sequence[Value]]
+_Decided = tuple[Sequence[Value], Sequence[Sequence[Value]]]
 
 
-def _decided_by_any(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
+def _decided_by_any(seen: Sequence[Value], memory: Sequence[Any], ask: _Ask) -> _Decided:
     return ask(seen), ()
 
 
@@ -38,15 +39,14 @@ class Decision:
 
     Attributes:
         network: Its network; None for none.
-        decide: Takes the observation, symbols of shape (k, N), what the agent remembers, and a
+        decide: Takes formulas: the elements of the observation, what the agent remembers, and a
             function that asks the network for its last values, or for any action if there is none.
-            Returns the elements of the action, environments last, and what the agent remembers
-            then.
+            Returns the elements of the action, and what the agent remembers then.
         starts: What it remembers at the beginning of an episode, by name.
     """
 
     network: Network | None = None
-    decide: Callable[[Any, Sequence[Any], _Ask], tuple[Any, Sequence[Any]]] = _decided_by_any
+    decide: Callable[[Sequence[Value], Sequence[Sequence[Value]], _Ask], _Decided] = _decided_by_any
     starts: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
@@ -64,60 +64,38 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     model = model.policy() if isinstance(model, Agent) else model
     if isinstance(model, Controller):
         policy = deepcopy(model) if isinstance(model, Policy) else Policy(deepcopy(model))
-        return _of_policy(policy.bind(env), env.observation_space)
+        return _of_policy(policy.bind(env))
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     if are_scaled(network.space, env.action_space):
         network = network.unscaled(env.action_space)
     return Decision(network, lambda seen, memory, ask: (network.chosen(ask(seen)), ()))
 
 
-def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
-    law, past = policy.baseline, policy.starts
-    _require_known(law, observed)
+def _of_policy(policy: Policy) -> Decision:
     if policy.choices and policy.masks is not None:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
+    controller, past = policy.baseline, policy.starts
     starts = dict(zip(_MEMORY, past, strict=False))  # without a history there are none
-    if isinstance(law, Law):
-        starts[_CONTROLLER] = np.array(law.starts, np.float64).reshape(-1)
+    if isinstance(controller, Law):
+        starts[_CONTROLLER] = np.array(controller.starts, np.float64).reshape(-1)
     network = _network_of(policy)
 
-    def constants(features: Any) -> Any:
-        return policy._network(np.empty(features.shape))
+    def decide(seen: Sequence[Value], memory: Sequence[Sequence[Value]], ask: _Ask) -> _Decided:
+        def changes(features: Sequence[Value]) -> Sequence[Value]:
+            if network is None:
+                return [seen[0].beside(one) for (one,) in policy._network(np.empty((1, 0)))]
+            return network.chosen(ask(features)) if policy.choices else ask(features)
 
-    def chosen(values: Any) -> Any:
-        return network.chosen(values) if network and policy.choices else values
-
-    def decide(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
-        rows = seen.cast(np.float64).T
-        base, state = _of_controller(policy, rows, memory[len(past) :])
-        given = constants if network is None else lambda features: chosen(ask(features.T))
-        before = tuple(one.T for one in memory[: len(past)])
-        action, past_now = policy.step(rows, before, base, given)
-        elements = policy._as_actions(np.stack(action, axis=-1))
-        return np.moveaxis(elements, 0, -1), [*(one.T for one in past_now), *state]
+        observation, count = [one.number for one in seen], len(past)
+        base: Sequence[Value] = [seen[0].beside(one) for (one,) in policy.middle]
+        states: list[Sequence[Value]] = []
+        if controller is not None:
+            base, state = controller.decision(observation, *memory[count:])
+            states = [state] if memory[count:] else []
+        action, now = policy.corrected(observation, memory[:count], base, changes)
+        return policy.action_of(action), [*now, *states]
 
     return Decision(network, decide, starts)
-
-
-def _require_known(law: Any, observed: spaces.Space[Any]) -> None:
-    if law is not None and not isinstance(law, Law):
-        raise ConfigError(
-            f"a controller of type {type(law).__name__} cannot be exported; a PID or a Hysteresis "
-            "can be"
-        )
-    parts = observed.spaces.values() if isinstance(observed, spaces.Dict) else [observed]
-    if not all(isinstance(part, spaces.Box) for part in parts):
-        raise ConfigError(
-            f"a policy that observes {observed} cannot be exported; a Box can be, or a Dict"
-        )
-
-
-def _of_controller(policy: Policy, rows: Any, memory: Sequence[Any]) -> tuple[Any, Sequence[Any]]:
-    """What the controller decides, shape (m, N), and what it remembers then."""
-    if isinstance(policy.baseline, Law):
-        action, state = policy.baseline.step(rows, memory[0])
-        return [action], [state]
-    return np.repeat(policy.middle, len(rows), axis=1), []
 
 
 def _network_of(policy: Policy) -> Network | None:

@@ -66,8 +66,8 @@ def agent_of(
     Args:
         env: The environment that the agent was trained in, without wrappers. Agents of a search
             and controllers need the physical form of a task, see ``Task.physical``.
-        model: An agent that a search has found, or its policy, a ``PID`` or a ``Hysteresis``; a
-            model of Stable-Baselines3 or sb3-contrib; or a ``Network``.
+        model: An agent that a search has found, or its policy; a ``PID``, a ``Hysteresis`` or an
+            ``LQR``; a model of Stable-Baselines3 or sb3-contrib; or a ``Network``.
         normalization: The ``VecNormalize`` of the training; None if there was none.
         name: What functions and files are called by: letters, digits and _.
         all_inputs: Whether the agent also writes inputs that no action changes, such as the

@@ -1,16 +1,15 @@
 """What surrounds the network of an agent: from measurements to its features, and to inputs.
 
-The hooks of the task are traced as those of vector environments are, and between them what the
-agent itself computes. Between two samples a controller knows its measurements and what it has
-kept: earlier measurements, actions and inputs, the episode variables that ``_update`` writes, and
-what the agent remembers.
+It consists of the formulas of the task, and between them of those of the agent. Between two samples
+a controller knows its measurements and what it has kept: earlier measurements, actions and inputs,
+the episode variables that the task writes, and what the agent remembers.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -24,14 +23,12 @@ from fmugym.errors import ConfigError
 from fmugym.export.decisions import Decision
 from fmugym.export.external import found_in
 from fmugym.export.imperfections import without_imperfections
-from fmugym.expressions.graph import Graph
-from fmugym.expressions.program import UntraceableError
-from fmugym.task.readings import Readings, reading
-from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.patches import exclusive
-from fmugym.vector.hooks.symbols import LANES, as_symbols, loaded_rows, spread
-from fmugym.vector.hooks.tables import tables_in
-from fmugym.vector.hooks.trace import Tracer
+from fmugym.expressions.formulas import Formulas
+from fmugym.expressions.graph import Graph, Node
+from fmugym.expressions.program import UncompilableError
+from fmugym.expressions.value import Value
+from fmugym.task.inside import is_overridden
+from fmugym.vector.hooks.formula_programs import Translation, written_variables
 
 __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
 
@@ -121,7 +118,7 @@ def logic_of(
     all_inputs: bool = False,
     external: Collection[str] = (),
 ) -> Logic:
-    """Trace what a task and its agent do between measurements and inputs, but for the network.
+    """Find what a task and its agent do between measurements and inputs, but for the network.
 
     Args:
         env: The environment. It is not stepped. What its sensors and actuators do is left out; see
@@ -133,8 +130,8 @@ def logic_of(
             them included, instead of looking them up in the task's tables.
 
     Raises:
-        ConfigError: If a hook does what cannot be translated, or reads what a controller does not
-            have, or the network is for another task. The text names the hook or the value.
+        ConfigError: If a hook of the task is a function of Python, or reads what a controller does
+            not have, or the network is for another task. The text names the hook or the value.
     """
     with without_imperfections(env) as ideal:
         return _logic_of_ideal(ideal, decision, all_inputs, external)
@@ -152,66 +149,89 @@ def _logic_of_ideal(
             f"{env.action_space}"
         )
     try:
-        with exclusive, borrowed(env), tables_in(env), reading(env, Readings.of(env)):
-            traced = _ControllerTracer(env, decision)
-        return _Assembly(env, traced, decision, all_inputs, external).logic()
-    except UntraceableError as error:
+        sample = _Sample(env, _formulas_of(env), decision)
+        return _Assembly(env, sample, decision, all_inputs, external).logic()
+    except UncompilableError as error:
         raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
 
 
-class _ControllerTracer(Tracer):
-    """Traces one sample of a controller in a single graph.
+_KEYS: Final[Mapping[str, str]] = {
+    "_get_inputs": "inputs",
+    "_update": "memory",
+    "_get_observation": "observations",
+}
+"""The hooks that are between measurements and inputs, and the keys of their formulas."""
+
+
+def _formulas_of(env: FMUEnv) -> Formulas:
+    """The formulas of a task; those of hooks that no controller needs may be missing.
+
+    Raises:
+        ConfigError: If a hook is a function of Python.
+    """
+    for hook, key in _KEYS.items():
+        if is_overridden(env, env.inside.base, hook):
+            raise ConfigError(
+                f"{type(env).__name__} cannot be exported: its hook {hook} is a function of "
+                f"Python; write expressions under the key {key!r} instead"
+            )
+    return env.inside.formulas or Formulas(Graph(), None, (), None, None, None, None, {})
+
+
+class _Sample:
+    """One sample of a controller in a single graph.
+
+    Args:
+        env: The environment.
+        formulas: Those of its task.
+        decision: What the agent computes.
 
     Attributes:
+        graph: The operations.
         observation, features, action: The nodes of each; features are what a network takes.
         inputs: The nodes of the FMU's inputs.
         are_chosen: Which of the inputs any action changes.
         updates: The nodes of what is remembered then, by name.
-        types: Their types, by name.
     """
 
-    features: tuple[int, ...] = ()
+    def __init__(self, env: FMUEnv, formulas: Formulas, decision: Decision) -> None:
+        self.graph = Graph()
+        self.features: tuple[int, ...] = ()
+        self._env, self._formulas, self._decision = env, formulas, decision
+        variables = written_variables(env, self.graph, formulas.updates)
+        observed = Translation(env, self.graph, True, variables).observation(formulas)
+        self.observation = _nodes(observed)
+        action, memory = self._decided(observed)
+        self.action = _nodes(action)
+        dtype = env.action_space.dtype
+        unknown = [self._row(_ANY_ACTION, i, dtype=dtype) for i in range(len(action))]
+        any_action = set(_nodes(unknown))
+        self.are_chosen = [
+            not any_action.isdisjoint(self.graph.needed([node]))
+            for node in self._inputs_after(unknown, variables)
+        ]
+        self.inputs = self._inputs_after(action, variables)
+        remembered = zip(decision.starts, map(_nodes, memory), strict=True)
+        self.updates = defaultdict[str, tuple[int, ...]](tuple, remembered)
+        for (_, name, *_), value in variables.items():
+            self.updates[name] += (value.node,)
 
-    def __init__(self, env: FMUEnv, decision: Decision) -> None:
-        super().__init__(env, {})
-        self._decision = decision
-        self.settle(self._trace)
+    def _row(self, *what: Any, dtype: Any = np.float64) -> Value:
+        return Value(self.graph, self.graph.load("row", what, dtype))
 
-    def _trace(self) -> None:
-        self._begin(judging=True)
-        stores, updated = self._trace_update()
-        nodes: dict[str, list[int]] = {name: [] for name in updated}
-        for store in stores:
-            row: Any = store.row
-            nodes[row[1]].append(store.node)
-        self.graph, self.observation = self._graph, self._observed()
-        action, memory = self._decided(self.observation)
-        self.action: list[int] = action.reshape(-1).tolist()
-        self.are_chosen, self.inputs = self._followed(action)
-        remembered = dict(zip(self._decision.starts, memory, strict=True))
-        self.updates = nodes | remembered
-        self.types = self._variables | dict.fromkeys(remembered, np.dtype(np.float64))
-
-    def _observed(self) -> tuple[int, ...]:
-        self._contents = Contents(self._env)
-        parts = self._call("_get_observation", lambda value: list(self._see_observation(value)))
-        return tuple(int(node) for _, nodes, _ in parts for node in nodes.reshape(-1))
-
-    def _decided(self, observation: Iterable[int]) -> tuple[npt.NDArray[Any], list[list[int]]]:
-        """The nodes of the action, and of what the agent remembers then."""
-        graph, space, double = self._graph, self._env.action_space, np.dtype(np.float64)
-        observed = [spread(graph, np.array(n), graph.nodes[n].dtype) for n in observation]
+    def _decided(
+        self, observation: Sequence[Value]
+    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
+        """The action, and what the agent remembers then."""
         memory = [
-            loaded_rows(graph, start.shape, "before", name)
+            [self._row("before", name, index) for index in range(start.size)]
             for name, start in self._decision.starts.items()
         ]
-        action, then = self._decision.decide(as_symbols(graph, observed), memory, self._asked)
-        shape = space.shape or ()
-        elements = as_symbols(graph, action).reshape(*shape, LANES)
-        kept = [self._nodes(one, None, double).tolist() for one in then]
-        return self._nodes(elements, shape, space.dtype), kept
+        action, then = self._decision.decide(observation, memory, self._asked)
+        dtype = np.dtype(self._env.action_space.dtype)
+        return [observation[0].beside(one).cast(dtype) for one in action], then
 
-    def _asked(self, features: Any) -> Any:
+    def _asked(self, features: Sequence[Value]) -> list[Value]:
         """The last values of the network for some features, or any action if there is no network.
 
         What the first layer takes is noted.
@@ -220,44 +240,53 @@ class _ControllerTracer(Tracer):
         count, dtype = math.prod(space.shape or ()), np.dtype(space.dtype)
         if network is not None:
             network.require_fitting(len(features), space)
-            features = network.scaled(features)
             count, dtype = sum(network.parts), network.dtype
-        self.features = tuple(self._nodes(features, None, None).tolist())
-        return loaded_rows(self._graph, (count,), _GIVEN, dtype=dtype)
+            features = [one.cast(dtype) for one in network.scaled(features)]
+        self.features = _nodes(features)
+        return [self._row(_GIVEN, index, dtype=dtype) for index in range(count)]
 
-    def _followed(self, action: npt.NDArray[Any]) -> tuple[tuple[bool, ...], tuple[int, ...]]:
-        """Which inputs any action changes, and the nodes of the inputs after the chosen one."""
-        env, dtype = self._env, np.dtype(self._env.action_space.dtype)
-        env.previous_action, env.previous_state = env.action, env.state
-        unknown = loaded_rows(self._graph, action.shape, _ANY_ACTION, dtype=dtype)
-        found = []
-        for one in (unknown, unknown.like(spread(self._graph, action, dtype).cells)):
-            env.action = one
-            self._contents = Contents(env)
-            found.append(self._call("_get_inputs", self._input_nodes))
-        any_action = {cell.node for cell in unknown.cells.flat}
-        are_chosen = (not any_action.isdisjoint(self._graph.needed([node])) for node in found[0])
-        return tuple(are_chosen), tuple(found[1])
+    def _inputs_after(
+        self, action: Sequence[Value], variables: Mapping[Any, Value]
+    ) -> tuple[int, ...]:
+        """The nodes of the inputs if some action is chosen now."""
+        last = Translation(self._env, self.graph, False)
+        actions = {("action", index): one for index, one in enumerate(action)}
+        actions |= {
+            ("previous_action", index): last.quantity("action", index)
+            for index in range(len(action))
+        }
+        values = Translation(self._env, self.graph, False, {**variables, **actions})
+        return _nodes(values.inputs(self._formulas))
+
+
+def _row_of(node: Node) -> Any:
+    """The row that a node loads; that of a variable is the same between two samples."""
+    row: Any = node.what
+    return ("before", *row[1:]) if row[0] == "variable" else row
+
+
+def _nodes(values: Iterable[Value]) -> tuple[int, ...]:
+    return tuple(value.node for value in values)
 
 
 class _Assembly:
-    """Makes a ``Logic`` of what was traced: only what the actions depend on is kept."""
+    """Makes a ``Logic`` of a sample: only what the actions depend on is kept."""
 
     def __init__(
         self,
         env: FMUEnv,
-        traced: _ControllerTracer,
+        sample: _Sample,
         decision: Decision,
         all_inputs: bool,
         external: Collection[str],
     ) -> None:
-        self._env, self._traced, self._graph = env, traced, traced.graph
+        self._env, self._sample, self._graph = env, sample, sample.graph
         rng = np.random.default_rng(_SEED)
         self._episode = env.inside.draws.draw(rng)
         self._starts = {**self._episode.variables, **decision.starts}
         self._drawn = set(env.inside.draws.drawn_names)
-        self._external = found_in(env, external, self._graph, traced.observation)
-        rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
+        self._external = found_in(env, external, self._graph, sample.observation)
+        rows = zip(env.inside.interface.inputs, sample.inputs, sample.are_chosen, strict=True)
         self._inputs = [
             (variable, node) for variable, node, is_chosen in rows if all_inputs or is_chosen
         ]
@@ -269,7 +298,7 @@ class _Assembly:
 
     def logic(self) -> Logic:
         """Find all that the features and the inputs depend on, from sample to sample."""
-        roots = [*self._traced.features, *(node for _, node in self._inputs)]
+        roots = [*self._sample.features, *(node for _, node in self._inputs)]
         needed = set(self._graph.needed(roots, self._external))
         while True:
             found = [*roots, *self._next_values(needed)]
@@ -290,7 +319,7 @@ class _Assembly:
             (*(outputs[place] for place in places), *self._external.values()),
             tuple(variable for variable, _ in self._inputs),
             tuple(node for _, node in self._inputs),
-            self._traced.features,
+            self._sample.features,
             tuple(self._kept),
             tuple(self._parameters),
             interface.time_step,
@@ -301,19 +330,19 @@ class _Assembly:
         found = defaultdict(list)
         for number in sorted(needed):
             node = self._graph.nodes[number]
-            row: Any = node.what if node.kind == "row" else (node.kind, node.what)
-            found[row[0]].append(row[1:])
+            kind, *what = _row_of(node) if node.kind == "row" else (node.kind, node.what)
+            found[kind].append(what)
         return found
 
     def _next_values(self, needed: Iterable[int]) -> Iterator[int]:
         """The nodes of what is kept for the next sample."""
         reads = self._reads(needed)
         for name, *_ in reads["before"]:
-            yield from self._traced.updates.get(name, ())
+            yield from self._sample.updates.get(name, ())
         if reads["input"]:
-            yield from self._traced.inputs
+            yield from self._sample.inputs
         if reads["action"] or reads["previous_action"]:
-            yield from self._traced.action
+            yield from self._sample.action
 
     def _measured(self, needed: Iterable[int]) -> list[int]:
         """The places of the values that are measured now, or were at the sample before."""
@@ -323,7 +352,7 @@ class _Assembly:
         for place in places:
             variable = (interface.outputs + interface.monitors)[place]
             if variable.causality != "output":
-                raise UntraceableError(
+                raise UncompilableError(
                     f"it needs {variable.name!r}, which is no output of the FMU (its causality is "
                     f"{variable.causality!r}), so that no controller can measure it"
                 )
@@ -337,47 +366,47 @@ class _Assembly:
             outputs = [self._output_node(place) for place in places]
             self._add("previous", np.dtype(np.float64), [0.0] * len(places), outputs)
         if reads["input"]:
-            self._add("inputs", np.dtype(np.float64), self._first_inputs(), self._traced.inputs)
+            self._add("inputs", np.dtype(np.float64), self._first_inputs(), self._sample.inputs)
         if reads["action"] or reads["previous_action"]:
             self._add_actions(has_older=bool(reads["previous_action"]))
-        for name in dict.fromkeys(name for name, *_ in reads["before"]):
-            self._add_variable(name)
-        for name, *_ in reads["parameter"]:
-            if name in self._drawn:
+        read, given = ({name for name, *_ in reads[kind]} for kind in ("before", "parameter"))
+        for name in self._starts:  # those that never change are constants
+            if name in read and (name in self._sample.updates or name in self._drawn):
+                self._add_variable(name)
+        for name in self._episode.parameters:
+            if name in given and name in self._drawn:
                 self._add_parameter(name)
 
     def _output_node(self, place: int) -> int:
         """The node of a measurement, which the graph gets if it has none yet."""
-        return self._graph.load("row", ("output", place), np.float64, 0).node
+        return self._graph.load("row", ("output", place), np.float64)
 
     def _first_inputs(self) -> list[float]:
         given = self._episode.parameters
         for name, _ in self._env.inside.start_inputs:
             if name in self._drawn:
-                raise UntraceableError(f"it reads the input {name!r}, whose first value is drawn")
+                raise UncompilableError(f"it reads the input {name!r}, whose first value is drawn")
         return [float(given.get(name, start)) for name, start in self._env.inside.start_inputs]
 
     def _add_actions(self, has_older: bool) -> None:
         space: Any = self._env.action_space
         dtype, first = np.dtype(space.dtype), np.ravel(self._env.inside.no_action)
-        self._add("action", dtype, first.tolist(), self._traced.action)
+        self._add("action", dtype, first.tolist(), self._sample.action)
         if has_older:
-            last = [self._graph.load("action", i, dtype, 0).node for i in range(len(first))]
+            last = [self._graph.load("action", i, dtype) for i in range(len(first))]
             self._add("previous_action", dtype, first.tolist(), last)
 
     def _add_variable(self, name: str) -> None:
-        dtype, value = self._traced.types[name], np.ravel(self._starts[name])
-        updates = self._traced.updates.get(name, ())
-        self._add(name, dtype, value.astype(dtype).tolist(), updates)
+        value = np.ravel(self._starts[name]).astype(np.float64)
+        self._add(name, value.dtype, value.tolist(), self._sample.updates.get(name, ()))
         if name in self._drawn:
             self._note_parameters(name, value, None)
 
     def _add_parameter(self, name: str) -> None:
-        if name not in self._fields:
-            own = self._episode.parameters[name]
-            value, variable = np.ravel(own), self._env.inside.interface.parameter(name, own)
-            self._add(name, np.dtype(np.float64), value.tolist(), ())
-            self._note_parameters(name, value, variable)
+        own = self._episode.parameters[name]
+        value, variable = np.ravel(own), self._env.inside.interface.parameter(name, own)
+        self._add(name, np.dtype(np.float64), value.tolist(), ())
+        self._note_parameters(name, value, variable)
 
     def _note_parameters(
         self, name: str, values: npt.NDArray[Any], variable: Variable | None
@@ -400,14 +429,12 @@ class _Assembly:
         if number in self._external:
             return "measurement", len(places) + list(self._external).index(number)
         match node.kind:
-            case "missing" | "stopped":
-                raise UntraceableError(f"{what or 'it reads whether the FMU has stopped'}")
             case "active":
                 return ("active",)
             case "action" | "previous_action":
                 return "kept", self._fields[node.kind], what
             case "row":
-                return self._row(what, places)
+                return self._row(_row_of(node), places)
         return None
 
     def _row(self, row: Any, places: list[int]) -> Load | None:
@@ -422,10 +449,12 @@ class _Assembly:
                 return ("count",)
             case "given":
                 return _GIVEN, row[1]
-            case "before":
+            case "before" if row[1] in self._fields:
                 return "kept", self._fields[row[1]], row[2]
+            case "before":
+                return "constant", float(np.ravel(self._starts[row[1]])[row[2]])
             case "parameter" if row[1] in self._drawn:
                 return "kept", self._fields[row[1]], 0
             case "parameter":
                 return "constant", float(self._episode.parameters[row[1]])
-        raise UntraceableError(f"it reads {row[0]!r}, which a controller does not have")
+        raise UncompilableError(f"it reads {row[0]!r}, which a controller does not have")

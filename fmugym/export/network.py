@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from fmugym.baselines.controller import either, limited
 from fmugym.errors import ConfigError, shown
 
 __all__ = ["ACTIVATIONS", "Activation", "Layer", "Network", "Scaling", "network_of"]
@@ -96,10 +97,11 @@ class Scaling:
     divisor: FloatArray
     limit: FloatArray
 
-    def __call__(self, observation: Any) -> Any:
-        """Normalize an observation of shape (k, ...), an array or symbols, with float64."""
-        scaled = (observation.astype(np.float64).T - self.mean) / self.divisor
-        return np.clip(scaled, -self.limit, self.limit).T
+    def __call__(self, observation: Iterable[Any]) -> list[Any]:
+        """Normalize the elements of an observation, numbers or formulas, with float64."""
+        facts = np.array([self.mean, self.divisor, self.limit], np.float64).T
+        pairs = zip(observation, facts, strict=True)
+        return [limited((one - mean) / by, -limit, limit) for one, (mean, by, limit) in pairs]
 
 
 @dataclass(frozen=True)
@@ -167,14 +169,13 @@ class Network:
         half, middle = (((high + sign * low) / 2).astype(self.dtype) for sign in (-1, 1))
         return replace(self, layers=(*self.layers, Layer(np.diag(half), middle)), space=space)
 
-    def scaled(self, observation: Any) -> Any:
-        """What the first layer takes, of an observation of shape (k, ...), an array or symbols."""
-        values = observation if self.scaling is None else self.scaling(observation)
-        return values.astype(self.dtype)
+    def scaled(self, observation: Sequence[Any]) -> Sequence[Any]:
+        """What the first layer takes, in its type then, of numbers or formulas."""
+        return observation if self.scaling is None else self.scaling(observation)
 
     def values(self, observation: FloatArray) -> FloatArray:
         """The last values for an observation of shape (k,)."""
-        values: FloatArray = self.scaled(observation)
+        values: FloatArray = np.array(self.scaled([*observation]), self.dtype)
         for layer in self.layers:
             values = layer.weights @ values + layer.bias
             for activation in layer.activations:
@@ -183,28 +184,36 @@ class Network:
 
     def action(self, observation: FloatArray) -> FloatArray:
         """The action for an observation of shape (k,), flat."""
-        action: FloatArray = self.chosen(self.values(observation)).astype(self.space.dtype)
-        return action
+        return np.array(self.chosen([*self.values(observation)]), self.space.dtype)
 
-    def chosen(self, values: Any) -> Any:
-        """The elements of the action that the last values mean; all may be arrays or symbols.
+    def chosen(self, values: Sequence[Any]) -> list[Any]:
+        """The elements of the action that the last values mean, numbers or formulas.
 
         They are brought into the range of a ``Box``. Otherwise the largest one of each part
         chooses.
-
-        Args:
-            values: Shape (n, ...).
         """
         space: Any = self.space
         if not isinstance(space, spaces.Box):
-            pairs = zip(
-                np.split(values, np.cumsum(self.parts)[:-1]), np.ravel(space.start), strict=True
-            )
-            return np.stack([np.argmax(part, axis=0) + start for part, start in pairs])
-        low, high = space.low.ravel(), space.high.ravel()
-        if self.squashed:
-            return (low + 0.5 * (values.T + 1) * (high - low)).T
-        return np.clip(values.T, low, high).T
+            ends = itertools.accumulate(self.parts, initial=0)
+            starts = np.ravel(space.start)
+            return [
+                _place_of_largest(values[end : end + count]) + start
+                for end, count, start in zip(ends, self.parts, starts, strict=False)
+            ]
+        limits = zip(values, space.low.flat, space.high.flat, strict=True)
+        if not self.squashed:
+            return [limited(one, low, high) for one, low, high in limits]
+        half, unit = self.dtype.type(0.5), self.dtype.type(1.0)
+        return [low + half * (one + unit) * (high - low) for one, low, high in limits]
+
+
+def _place_of_largest(values: Sequence[Any]) -> Any:
+    """The place of the largest value, the first one of several."""
+    place, largest = 0, values[0]
+    for index, one in enumerate(values[1:], 1):
+        is_larger = one > largest
+        place, largest = either(is_larger, index, place), either(is_larger, one, largest)
+    return place
 
 
 def network_of(modules: Any, space: spaces.Space[Any], **more: Any) -> Network:

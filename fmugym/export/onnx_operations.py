@@ -1,4 +1,4 @@
-"""The operations of traced hooks as nodes of ONNX.
+"""The operations of graphs as nodes of ONNX.
 
 Where ONNX Runtime has a function in float32 only, or not at all, it is composed of others.
 """
@@ -13,9 +13,9 @@ import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.onnx_nodes import Nodes
-from fmugym.expressions.graph import Cell, Graph, Node
+from fmugym.expressions.graph import Graph, Node
 from fmugym.expressions.program import letter_of, operation_of
-from fmugym.vector.hooks.symbols import Symbols
+from fmugym.expressions.value import Value, where
 
 __all__ = ["Operations"]
 
@@ -48,7 +48,7 @@ _ANGLES: Final[Mapping[str, str]] = {"arcsin": "Asin", "arccos": "Acos", "arctan
 def _remainder(a: Any, b: Any) -> Any:
     """The remainder with the sign of the divisor."""
     rest = np.fmod(a, b)
-    return np.where((rest != 0.0) & ((rest < 0.0) != (b < 0.0)), rest + b, rest)
+    return where((rest != 0.0) & ((rest < 0.0) != (b < 0.0)), rest + b, rest)
 
 
 def _arctan2(y: Any, x: Any) -> Any:
@@ -56,12 +56,12 @@ def _arctan2(y: Any, x: Any) -> Any:
     length = np.hypot(x, y)
     below = length + x
     is_axis = below == 0.0
-    angle = 2.0 * np.arctan(y / np.where(is_axis, 1.0, below))
-    return np.where(is_axis, np.where(length == 0.0, 0.0, math.pi), angle)
+    angle = 2.0 * np.arctan(y / where(is_axis, 1.0, below))
+    return where(is_axis, where(length == 0.0, 0.0, math.pi), angle)
 
 
 _COMPOSED: Final[Mapping[str, Callable[..., Any]]] = {
-    "not_equal": lambda a, b: ~(a == b),
+    "not_equal": lambda a, b: (a == b) ^ True,
     "remainder": _remainder,
     "floor_divide": lambda a, b: np.rint((a - np.remainder(a, b)) / b),
     "hypot": lambda a, b: np.sqrt(a * a + b * b),
@@ -78,7 +78,7 @@ _COMPOSED: Final[Mapping[str, Callable[..., Any]]] = {
     "expm1": lambda x: np.exp(x) - 1.0,
     "exp2": lambda x: np.power(2.0, x),
 }
-"""Functions of symbols, by others that ONNX has."""
+"""Functions of values, by others that ONNX has."""
 
 
 class Operations:
@@ -128,8 +128,8 @@ class Operations:
 
     def _function(self, ufunc: Any, numbers: Iterable[int]) -> str:
         add, operands = self._nodes.add, [self._names[number] for number in numbers]
-        symbols = list(map(self._symbol, numbers))
-        dtype = symbols[0].dtype
+        values = list(map(self._value, numbers))
+        dtype = values[0].dtype
         operation = str(operation_of(ufunc, letter_of(dtype)))
         match operation:
             case "fmod d":
@@ -146,21 +146,20 @@ class Operations:
             narrow = self._nodes.cast(operands[0], np.dtype(np.float32))
             return self._nodes.cast(add(_ANGLES[name], narrow), dtype)
         if name in _COMPOSED:
-            return self._composed(_COMPOSED[name](*symbols))
+            return self._composed(_COMPOSED[name](*values))
         raise ConfigError(f"numpy.{name} of type {dtype} cannot be exported to ONNX")
 
-    def _symbol(self, number: int) -> Symbols:
-        cell = np.array(Cell(number, None), object)
-        return Symbols(self._graph, cell, self._graph.nodes[number].dtype)
+    def _value(self, number: int) -> Value:
+        return Value(self._graph, number)
 
-    def _named(self, name: str) -> Symbols:
+    def _named(self, name: str) -> Value:
         """A result of the model that the graph did not know."""
-        number = self._graph.load("node", name, np.float64, None).node
+        number = self._graph.load("node", name, np.float64)
         self._names[number] = name
-        return self._symbol(number)
+        return self._value(number)
 
-    def _composed(self, symbols: Any) -> str:
-        (name,) = self.written([symbols.cells.item().node])
+    def _composed(self, value: Value) -> str:
+        (name,) = self.written([value.node])
         return name
 
     def _interpolated(self, number: int, table: Any) -> str:
@@ -170,7 +169,7 @@ class Operations:
             number: Where to look.
             table: The arguments, the values, and the values before the first and after the last.
         """
-        count, nodes, x = len(table) // 2 - 1, self._nodes, self._symbol(number)
+        count, nodes, x = len(table) // 2 - 1, self._nodes, self._value(number)
         place = self._place(self._names[number], nodes.tensor(table[:count]))
         following = nodes.add("Add", place, nodes.constant(1, np.dtype(np.int64)))
         after = nodes.add("Min", following, nodes.constant(count - 1, np.dtype(np.int64)))
@@ -180,9 +179,9 @@ class Operations:
             for one in (place, after)
         )
         width = high - low
-        slope = (last - first) / np.where(width == 0.0, 1.0, width)  # both are the last one
-        inside = np.where(x < table[0], table[-2], slope * (x - low) + first)
-        return self._composed(np.where(x > table[count - 1], table[-1], inside))
+        slope = (last - first) / where(width == 0.0, 1.0, width)  # both are the last one
+        inside = where(x < table[0], table[-2], slope * (x - low) + first)
+        return self._composed(where(x > table[count - 1], table[-1], inside))
 
     def _place(self, x: str, arguments: str) -> str:
         """The number of the last argument that is not above x; of the first one if all are."""

@@ -1,4 +1,4 @@
-"""The operations of traced hooks as expressions in C."""
+"""The operations of graphs as expressions in C."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
@@ -49,9 +48,12 @@ def network_of_model(model: Any, normalization: Any = None) -> Network:
             f"a policy of {type(model).__name__} ({kinds[0]}) cannot be exported{why}; those of "
             "PPO, A2C, TRPO, SAC, TQC, TD3, DDPG, DQN and QRDQN with 'MlpPolicy' can"
         )
+    space = model.observation_space
+    if not isinstance(space, spaces.Box):
+        raise ConfigError(f"a policy that observes {space} cannot be exported; a Box can be")
     network = readers[0](model.policy)
     if normalization is not None and normalization.norm_obs:
-        network = replace(network, scaling=_scaling(normalization, model.observation_space))
+        network = replace(network, scaling=_scaling(normalization))
     _require_same(model, normalization, network)
     return network
 
@@ -120,45 +122,32 @@ _REFUSED: Final[dict[str, str]] = {
 
 
 def _require_flat(extractor: Any) -> None:
-    """Refuse what does more than put the parts of an observation side by side."""
+    """Refuse what does more than flatten an observation."""
     kind = type(extractor).__name__
-    parts = getattr(extractor, "extractors", {})
-    inner = (
-        {type(part).__name__ for part in parts.values()} if kind == "CombinedExtractor" else set()
-    )
-    if kind not in {"FlattenExtractor", "CombinedExtractor"} or inner - {"Flatten"}:
-        names = ", ".join(sorted(inner - {"Flatten"})) or kind
-        raise ConfigError(f"a policy whose features come from {names} cannot be exported")
+    if kind != "FlattenExtractor":
+        raise ConfigError(f"a policy whose features come from {kind} cannot be exported")
 
 
-def _scaling(normalization: Any, space: Any) -> Scaling:
-    """The normalization of each element of an observation, parts of dicts side by side."""
-    is_dict, rms = isinstance(space, spaces.Dict), normalization.obs_rms
-    parts, known = (dict(space), rms) if is_dict else ({"": space}, {"": rms})
-    rows = []
-    for name, part in parts.items():
-        row = [0.0, 1.0, np.inf]
-        if name in known:
-            divisor = np.sqrt(known[name].var + normalization.epsilon)
-            row = [known[name].mean.ravel(), divisor.ravel(), normalization.clip_obs]
-        rows.append([np.broadcast_to(one, math.prod(part.shape)) for one in row])
-    return Scaling(*map(np.concatenate, zip(*rows, strict=True)))
+def _scaling(normalization: Any) -> Scaling:
+    """The normalization of each element of an observation."""
+    rms = normalization.obs_rms
+    mean, divisor = rms.mean.ravel(), np.sqrt(rms.var + normalization.epsilon).ravel()
+    return Scaling(mean, divisor, np.full(mean.shape, normalization.clip_obs))
 
 
 def _require_same(model: Any, normalization: Any, network: Network) -> None:
     """Compare the network with the model: a class derived from a known policy may do more."""
     rng, space = np.random.default_rng(0), model.observation_space
     for _ in range(_TRIALS):
-        observation = _sample(space, rng)
+        observation = rng.normal(size=space.shape).astype(space.dtype)
         seen = observation if normalization is None else normalization.normalize_obs(observation)
         wanted = np.ravel(model.predict(seen, deterministic=True)[0])
-        flat: Any = spaces.flatten(space, observation)
-        own = network.action(flat)
+        own = network.action(observation.ravel())
         if isinstance(network.space, spaces.Box):
             size = np.ravel(network.space.high - network.space.low)
             same = np.abs(own - wanted) <= _TOLERANCE * np.maximum(1.0, np.minimum(size, 1e6))
         else:
-            same = (own == wanted) | _is_tie(network, flat)
+            same = (own == wanted) | _is_tie(network, observation.ravel())
         if not np.all(same):
             raise ConfigError(
                 f"the policy {type(model.policy).__name__} cannot be exported: it does more than "
@@ -171,13 +160,3 @@ def _is_tie(network: Network, observation: npt.NDArray[Any]) -> bool:
     values, ends = network.values(observation), np.cumsum(network.parts)[:-1]
     tops = (np.sort(part)[-2:] for part in np.split(values, ends))
     return any(top[-1] - top[0] <= _TOLERANCE * (1 + abs(top[-1])) for top in tops)
-
-
-def _sample(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
-    if isinstance(space, spaces.Dict):
-        return {name: _sample(part, rng) for name, part in space.spaces.items()}
-    if not isinstance(space, spaces.Box):
-        raise ConfigError(
-            f"a policy that observes {space} cannot be exported; a Box can be, or a Dict"
-        )
-    return rng.normal(size=space.shape).astype(space.dtype)

@@ -14,13 +14,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.expressions.formulas import Update
+from fmugym.expressions.formulas import Formulas, Update
 from fmugym.expressions.graph import Graph, Node
 from fmugym.expressions.lowering import registers_of
 from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value
 
-__all__ = ["function_of", "update_by"]
+__all__ = ["function_of", "hooks_of", "update_by"]
 
 
 def function_of(result: Computed) -> Callable[[Any], Any]:
@@ -54,6 +54,23 @@ def function_of(result: Computed) -> Callable[[Any], Any]:
         return _each(find, form)
 
     return evaluate
+
+
+def hooks_of(formulas: Formulas) -> dict[str, Callable[[Any], Any]]:
+    """Make the hooks of a step that formulas stand for, by the names of the hooks."""
+    inputs = formulas.inputs
+    if inputs is not None and len(inputs) == 1:
+        inputs = inputs[0]  # type: ignore[assignment]  # a number for one input
+    values = {
+        "_get_inputs": inputs,
+        "_is_done": formulas.terminated,
+        "_is_truncated": formulas.truncated,
+        "_reward_policy": formulas.reward,
+        "_get_observation": formulas.observation,
+        "_get_info": formulas.info or None,
+    }
+    hooks = {hook: function_of(value) for hook, value in values.items() if value is not None}
+    return hooks | ({"_update": update_by(formulas.updates)} if formulas.updates else {})
 
 
 def update_by(updates: Sequence[Update]) -> Callable[[Any], None]:
@@ -145,7 +162,7 @@ def _remainder(first: Any, second: Any) -> Any:
 
 
 def _power(base: Any, exponent: Any) -> Any:
-    """The function ``pow`` of C, of symbols too, which take a product for a constant exponent."""
+    """The function ``pow`` of C."""
     return np.float_power(*np.broadcast_arrays(base, exponent))[()]
 
 
@@ -153,8 +170,6 @@ def _power_of_float32(base: Any, exponent: Any) -> Any:
     """The function ``powf`` of C; numpy's loop over arrays may round otherwise."""
     operands = (np.float32(one) if isinstance(one, float) else one for one in (base, exponent))
     bases, exponents = np.broadcast_arrays(*operands)
-    if type(bases) is not np.ndarray:  # but symbols
-        return np.power(bases, exponents)
     pairs = zip(bases.flat, exponents.flat, strict=True)
     return np.array([one**other for one, other in pairs], np.float32).reshape(bases.shape)[()]
 

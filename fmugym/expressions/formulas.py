@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from fmugym.expressions.graph import Graph
 from fmugym.expressions.value import Computed, Value
 
 __all__ = ["Formulas", "Update"]
@@ -18,6 +19,7 @@ class Formulas:
     """The formulas of a task, in the order of a step.
 
     Attributes:
+        graph: Has all of them.
         inputs: The FMU's inputs; None for the elements of the action.
         updates: What is written to episode variables when the FMU has stepped, one after the other.
         terminated: Whether the task has ended; None for never.
@@ -27,6 +29,7 @@ class Formulas:
         info: Facts about the step by name.
     """
 
+    graph: Graph
     inputs: Sequence[Value] | None
     updates: Sequence[Update]
     terminated: Value | None

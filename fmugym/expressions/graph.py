@@ -1,19 +1,16 @@
-"""What hooks compute, as a graph of operations on single values."""
+"""What a task computes, as a graph of operations on single values."""
 
 from __future__ import annotations
 
 from collections.abc import Container, Hashable, Iterable
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.expressions.program import UntraceableError, is_function, letter_of, operation_of
+from fmugym.expressions.program import letter_of
 
-__all__ = ["TOLERANCES", "Cell", "Graph", "Node"]
-
-
-_array: Final = np.array  # while hooks are traced, another function stands in its place
+__all__ = ["Graph", "Node"]
 
 
 class Node(NamedTuple):
@@ -21,8 +18,8 @@ class Node(NamedTuple):
 
     Attributes:
         kind: ``constant``, ``row``, ``action``, ``previous_action``, ``active``, ``stopped``,
-            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``.
-        what: The value, the row, the element, the reason, the function or the table.
+            ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``.
+        what: The value, the row, the element, the function or the table.
         operands: The numbers of the nodes that it is computed from.
         dtype: The type of the value.
     """
@@ -39,42 +36,18 @@ class Node(NamedTuple):
         return np.frombuffer(bits, self.dtype)[0]
 
 
-class Cell:
-    """An element of a symbolic array: a node for the environment in one lane.
-
-    Args:
-        node: The number of the node.
-        lane: The place of the environment on its axis; None if the value is the same for all.
-    """
-
-    __slots__ = ("lane", "node")
-
-    def __init__(self, node: int, lane: int | None) -> None:
-        self.node, self.lane = node, lane
-
-
 class Graph:
-    """The nodes of one program, equal ones once.
+    """The nodes of one program or task, equal ones once. Nodes go by their numbers.
 
     Attributes:
+        nodes: The nodes, each behind its operands.
         tables: The values to look up.
-        tolerance: How far results may differ from those of hooks on arrays, relative to the largest
-            one.
     """
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
         self.tables: dict[Hashable, npt.NDArray[Any]] = {}
-        self.tolerance = 0.0
-
-    def tolerate(self, dtype: np.dtype[Any]) -> None:
-        """Note that values of this type are not computed as numpy computes them."""
-        self.tolerance = max(self.tolerance, TOLERANCES[dtype.itemsize])
-
-    def node(self, cell: Cell) -> Node:
-        """The node of a cell."""
-        return self.nodes[cell.node]
 
     def needed(self, numbers: Iterable[int], known: Container[int] = ()) -> list[int]:
         """The numbers of some nodes, and of all that they are computed from.
@@ -99,77 +72,54 @@ class Graph:
                 waiting.extend((operand, False) for operand in reversed(operands))
         return order
 
-    def load(self, kind: str, what: Hashable, dtype: npt.DTypeLike, lane: int | None) -> Cell:
+    def load(self, kind: str, what: Hashable, dtype: npt.DTypeLike) -> int:
         """A value that the program finds."""
-        return Cell(self._number(Node(kind, what, (), np.dtype(dtype))), lane)
+        return self.add(kind, what, (), np.dtype(dtype))
 
-    def constant(self, value: Any, dtype: np.dtype[Any]) -> Cell:
+    def constant(self, value: Any, dtype: np.dtype[Any]) -> int:
         """A value that is known. Zeros of different sign are two constants."""
         letter_of(dtype)
-        bits = _array(value, dtype).tobytes()
-        return Cell(self._number(Node("constant", bits, (), dtype)), None)
+        return self.add("constant", np.array(value, dtype).tobytes(), (), dtype)
 
-    def value(self, cell: Cell) -> Any:
+    def value(self, number: int) -> Any:
         """The value of a constant; None for anything else."""
-        node = self.node(cell)
+        node = self.nodes[number]
         return node.number if node.kind == "constant" else None
 
     def compute(
-        self, kind: str, what: Any, cells: tuple[Cell, ...], dtype: np.dtype[Any], fold: Any
-    ) -> Cell:
-        """A value computed from others; that of constants is computed at once."""
-        letter_of(dtype)
-        lanes = {cell.lane for cell in cells if cell.lane is not None}
-        if len(lanes) > 1:
-            raise UntraceableError("it mixes the values of several environments")
-        if not lanes and all(self.node(cell).kind == "constant" for cell in cells):
-            values = [_array([self.value(cell)]) for cell in cells]
-            with np.errstate(all="ignore"):
-                return self.constant(fold(*values)[0], dtype)
-        return Cell(self.add(kind, what, cells, dtype).node, lanes.pop() if lanes else None)
-
-    def add(self, kind: str, what: Any, cells: tuple[Cell, ...], dtype: np.dtype[Any]) -> Cell:
-        """A node as it is in another graph, the same for all environments."""
-        operands = tuple(cell.node for cell in cells)
-        return Cell(self._number(Node(kind, what, operands, dtype)), None)
-
-    def cast(self, cell: Cell, dtype: np.dtype[Any]) -> Cell:
-        """The value in another type."""
-        source = self.node(cell).dtype
-        if source == dtype:
-            return cell
-        letter_of(source)
-        return self.compute("cast", None, (cell,), dtype, lambda value: value.astype(dtype))
-
-    def choose(self, condition: Cell, first: Cell, second: Cell) -> Cell:
-        """The first value where the condition holds, otherwise the second; of the same type."""
-        if first.node == second.node and first.lane == second.lane:
-            return first
-        dtype = self.node(first).dtype
-        return self.compute("where", None, (condition, first, second), dtype, np.where)
-
-    def apply(self, ufunc: np.ufunc, cells: tuple[Cell, ...], dtype: np.dtype[Any]) -> Cell:
-        """A function of numpy of values that have the types of one of its loops.
+        self, kind: str, what: Any, operands: tuple[int, ...], dtype: np.dtype[Any], fold: Any
+    ) -> int:
+        """A node that is computed from others; that of constants is computed at once, by ``fold``.
 
         Raises:
-            UntraceableError: If programs do not have it for these types.
+            UncompilableError: If programs have no values of this type.
         """
-        if ufunc is np.positive:
-            return cells[0]
-        letters = {letter_of(self.node(cell).dtype) for cell in cells}
-        operation = operation_of(ufunc, letters.pop()) if len(letters) == 1 else None
-        if operation is None:
-            raise UntraceableError(f"it uses numpy.{ufunc.__name__} of {dtype}")
-        if is_function(operation):
-            self.tolerate(dtype)
-        return self.compute("ufunc", ufunc, cells, dtype, ufunc)
+        letter_of(dtype)
+        if all(self.nodes[number].kind == "constant" for number in operands):
+            values = [np.array([self.value(number)]) for number in operands]
+            with np.errstate(all="ignore"):
+                return self.constant(fold(*values)[0], dtype)
+        return self.add(kind, what, operands, dtype)
 
-    def _number(self, node: Node) -> int:
+    def add(self, kind: str, what: Any, operands: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+        """A node, which may stand in the graph already."""
+        node = Node(kind, what, operands, dtype)
         number = self._numbers.setdefault(node, len(self.nodes))
         if number == len(self.nodes):
             self.nodes.append(node)
         return number
 
+    def cast(self, number: int, dtype: np.dtype[Any]) -> int:
+        """The value in another type."""
+        source = self.nodes[number].dtype
+        if source == dtype:
+            return number
+        letter_of(source)
+        return self.compute("cast", None, (number,), dtype, lambda value: value.astype(dtype))
 
-TOLERANCES: Final = {4: 1e-5, 8: 1e-12}
-"""By bytes of a float."""
+    def choose(self, condition: int, first: int, second: int) -> int:
+        """The first value where the condition holds, otherwise the second; of the same type."""
+        if first == second:
+            return first
+        dtype = self.nodes[first].dtype
+        return self.compute("where", None, (condition, first, second), dtype, np.where)

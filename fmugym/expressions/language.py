@@ -2,9 +2,9 @@
 
 The grammar is a part of Python's: numbers, names, ``+ - * / % **``, comparisons, ``and``, ``or``,
 ``not``, ``a if condition else b``, and calls of functions, see ``FUNCTIONS`` in
-``fmugym.expressions.mathematics``. ``previous(x)`` is the value of ``x`` before the step. There are
-no attributes, subscripts, texts or assignments. Each value is a number or a condition; in
-arithmetic a condition counts as 0 or 1.
+``fmugym.expressions.mathematics``. ``previous(x)`` is the value of ``x`` before the step. A name
+may have dots and indices, as those of an FMU do: ``zone[1].T``. There are no texts or assignments.
+Each value is a number or a condition; in arithmetic a condition counts as 0 or 1.
 
 An expression becomes nodes of a graph, see ``fmugym.expressions.value``. Its only names are those
 that the caller gives. It works element by element, so that it serves one environment and arrays of
@@ -18,7 +18,7 @@ import copy
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial, reduce
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -93,7 +93,7 @@ class Expression:
     """
 
     text: str
-    tree: ast.expr
+    tree: ast.expr = field(repr=False, compare=False)
 
     @classmethod
     def parse(cls, value: Any) -> Expression:
@@ -133,20 +133,19 @@ class Expression:
     @property
     def names(self) -> set[str]:
         """The names that it reads."""
-        found = {node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name)}
-        return found - FUNCTIONS.keys() - {"previous"}
+        return set(_names_in(self.text, self.tree))
 
     @property
     def previous_names(self) -> set[str]:
         """The names whose values before the step it reads."""
         calls = [node for node in ast.walk(self.tree) if isinstance(node, ast.Call)]
-        return {
-            argument.id
+        found = {
+            _name_of(self.text, argument)
             for call in calls
             if isinstance(call.func, ast.Name) and call.func.id == "previous"
             for argument in call.args
-            if isinstance(argument, ast.Name)
         }
+        return {name for name in found if name is not None}
 
     def differences(self, *, or_comparisons: bool = False) -> Iterator[tuple[Any, Any]]:
         """Both sides of each minus: a name, a number, or None for anything else.
@@ -235,6 +234,27 @@ def _check_size(text: str, tree: ast.expr) -> None:
         )
 
 
+def _name_of(text: str, node: ast.expr) -> str | None:
+    """The name that a part of an expression is; None if it is anything else."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if not isinstance(node, ast.Attribute | ast.Subscript):
+        return None
+    return "".join((ast.get_source_segment(text.strip(), node) or "").split())
+
+
+def _names_in(text: str, node: ast.expr) -> Iterator[str]:
+    """The names in a part of an expression, without those of functions."""
+    name = _name_of(text, node)
+    if name is not None:
+        yield name
+        return
+    parts = node.args if isinstance(node, ast.Call) else ast.iter_child_nodes(node)
+    for part in parts:
+        if isinstance(part, ast.expr):
+            yield from _names_in(text, part)
+
+
 def _name_or_number(node: ast.expr) -> str | float | None:
     match node:
         case ast.Name(name):
@@ -258,13 +278,6 @@ class _Evaluation:
     def evaluate(self, node: ast.expr) -> Value:
         """The value of a part of the expression."""
         method = getattr(self, f"_value_of_{type(node).__name__.lower()}", None)
-        if isinstance(node, ast.Attribute | ast.Subscript):
-            name = ast.get_source_segment(self._text.strip(), node)
-            raise self._error(
-                node,
-                f"{shown(name)} cannot stand in an expression; a variable of this name needs an "
-                f'alias in [variables]: alias = {{ name = "{name}" }}',
-            )
         if method is None:
             what = type(node).__name__.lower()
             raise self._error(node, f"{what} is not allowed here")
@@ -299,14 +312,17 @@ class _Evaluation:
             raise self._error(node, f"{shown(node.value)} is no number")
         return self._constant(value)
 
-    def _value_of_name(self, node: ast.Name) -> Value:
-        if node.id in CONSTANTS:
-            return self._constant(CONSTANTS[node.id])
-        value = self._names.find(node.id)
+    def _value_of_name(self, node: ast.expr) -> Value:
+        name = _name_of(self._text, node) or ""
+        if name in CONSTANTS:
+            return self._constant(CONSTANTS[name])
+        value = self._names.find(name)
         if value is None:
             known = [*self._names.known(), *CONSTANTS]
-            raise self._error(node, unknown_name("name", node.id, known))
+            raise self._error(node, unknown_name("name", name, known))
         return value
+
+    _value_of_attribute = _value_of_subscript = _value_of_name
 
     def _constant(self, number: float | bool) -> Value:
         return Value.of(self._names.graph, number)
@@ -378,8 +394,8 @@ class _Evaluation:
         return value
 
     def _value_of_previous(self, node: ast.Call) -> Value:
-        names = [argument.id for argument in node.args if isinstance(argument, ast.Name)]
-        if len(names) != 1 or len(node.args) != 1:
+        names = [_name_of(self._text, argument) for argument in node.args]
+        if len(names) != 1 or names[0] is None:
             raise self._error(node, "previous takes one name")
         self.evaluate(node.args[0])  # which refuses an unknown name
         value = self._names.find_previous(names[0])

@@ -17,7 +17,7 @@ from fmugym.expressions.program import (
     TYPES,
     Program,
     Row,
-    UntraceableError,
+    UncompilableError,
     letter_of,
     operation_of,
 )
@@ -55,7 +55,7 @@ def compile_graph(
         seen: The number of arrays of observations.
 
     Raises:
-        UntraceableError: If there are too many operations, or the pool does not have one of them.
+        UncompilableError: If there are too many operations, or the pool does not have one of them.
     """
     compiler = _Compiler(graph)
     rows = compiler.number_outputs(stores)
@@ -101,11 +101,9 @@ class _Compiler:
         if node.kind == "constant":
             self._constants.append(number)
             return
-        if node.kind == "missing":
-            raise UntraceableError(str(node.what))
         self._steps.append(_Step(*self._operation(node), number, node.operands))
         if len(self._steps) > _MOST_INSTRUCTIONS:
-            raise UntraceableError(f"it has more than {_MOST_INSTRUCTIONS} operations")
+            raise UncompilableError(f"it has more than {_MOST_INSTRUCTIONS} operations")
 
     def number_outputs(self, stores: Sequence[Store]) -> list[int | None]:
         """Let the rows of outputs that are observed side by side follow each other."""
@@ -176,7 +174,7 @@ class _Compiler:
             [(step.node, step.operands) for step in self._steps], self._constants, results
         )
         if max(registers.values(), default=0) >= MOST_REGISTERS:
-            raise UntraceableError(f"it needs more than {MOST_REGISTERS} values at a time")
+            raise UncompilableError(f"it needs more than {MOST_REGISTERS} values at a time")
         code = np.zeros((len(self._steps), 6), np.uint16)
         for line, step in zip(code, self._steps, strict=True):
             line[:2] = OPERATIONS.index(step.operation), step.extra
@@ -202,7 +200,7 @@ class _Compiler:
             place["to"], place["size"] = registers[number], len(bits)
         if sys.byteorder == "little":
             return constants
-        raise UntraceableError("this processor stores numbers in another order")
+        raise UncompilableError("this processor stores numbers in another order")
 
 
 def _with_pairs(steps: Sequence[_Step]) -> list[_Step]:

@@ -22,14 +22,12 @@ __all__ = [
     "LETTERS",
     "OPERATIONS",
     "TYPES",
-    "DifferenceError",
     "Program",
-    "UntraceableError",
+    "UncompilableError",
     "evaluate",
     "is_function",
     "letter_of",
     "operation_of",
-    "writes_variable",
 ]
 
 _OF_EACH_TYPE: Final = (
@@ -100,25 +98,8 @@ def _engine() -> Any:
     return _native
 
 
-class UntraceableError(Exception):
-    """A hook does what a program cannot do."""
-
-
-class DifferenceError(UntraceableError):
-    """The program of a hook gives other values than the hook.
-
-    Args:
-        hook: Its name.
-    """
-
-    def __init__(self, hook: str) -> None:
-        super().__init__(f"the program gives other values than {hook}")
-        self.hook = hook
-
-
-def writes_variable(name: str) -> str:
-    """Say why hooks cannot be compiled if another one than ``_update`` writes a variable."""
-    return f"a hook writes the episode variable {name!r}, which only _update may do"
+class UncompilableError(Exception):
+    """An expression has what a program cannot have."""
 
 
 LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
@@ -129,11 +110,11 @@ def letter_of(dtype: npt.DTypeLike) -> str:
     """The letter of a type.
 
     Raises:
-        UntraceableError: If programs have no values of this type.
+        UncompilableError: If programs have no values of this type.
     """
     letter = LETTERS.get(np.dtype(dtype))
     if letter is None:
-        raise UntraceableError(f"it computes with {np.dtype(dtype)}")
+        raise UncompilableError(f"it computes with {np.dtype(dtype)}")
     return letter
 
 

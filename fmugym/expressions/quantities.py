@@ -44,7 +44,9 @@ QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
         EpisodeQuantity("step_count", "step_count", "step_count", "step_count", np.dtype(np.int64)),
         EpisodeQuantity("time", "time"),
         EpisodeQuantity("done", "done", dtype=np.dtype(np.bool_)),
+        EpisodeQuantity("after_end", "after_end", dtype=np.dtype(np.bool_)),
     )
 }
 """By name. ``outputs`` are those of the config and the monitored variables. Programs take the
-action from the pool, compute the time from the steps, and know ``done`` once they have found it."""
+action from the pool, compute the time from the steps, know ``done`` once they have found it, and
+run no step after the end of an episode."""

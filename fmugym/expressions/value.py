@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError
-from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.graph import Graph
 from fmugym.expressions.program import operation_of
 from fmugym.expressions.quantities import QUANTITIES
 
@@ -25,12 +25,17 @@ _MOST_NODES: Final = 150_000
 """A forecast of 2000 values with errors that grow and last, normalized, takes some 110,000."""
 
 _DOUBLE: Final = np.dtype(np.float64)
+_SINGLE: Final = np.dtype(np.float32)
 _INTEGER: Final = np.dtype(np.int64)
 _FLAG: Final = np.dtype(np.bool_)
 
 
 def _operator(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
     return lambda own, other: own.applied(ufunc, own, other)
+
+
+def _reflected(ufunc: np.ufunc) -> Callable[[Value, Any], Value]:
+    return lambda own, other: own.applied(ufunc, other, own)
 
 
 class Value:
@@ -40,16 +45,16 @@ class Value:
 
     Args:
         graph: Has the node.
-        cell: Refers to it.
+        node: The number of the node.
 
     Raises:
         ConfigError: If there are too many nodes.
     """
 
-    __slots__ = ("cell", "graph")
+    __slots__ = ("graph", "node")
 
-    def __init__(self, graph: Graph, cell: Cell) -> None:
-        self.graph, self.cell = graph, cell
+    def __init__(self, graph: Graph, node: int) -> None:
+        self.graph, self.node = graph, node
         if len(graph.nodes) > _MOST_NODES:
             raise ConfigError(f"the task has too many terms: it computes more than {_MOST_NODES}")
 
@@ -72,17 +77,12 @@ class Value:
         """
         if dtype is None:
             dtype = QUANTITIES[name].dtype if name in QUANTITIES else _DOUBLE
-        return cls(graph, graph.load("row", (name, *keys), dtype, None))
-
-    @property
-    def node(self) -> int:
-        """The number of the node."""
-        return self.cell.node
+        return cls(graph, graph.load("row", (name, *keys), dtype))
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """The type of the value."""
-        return self.graph.node(self.cell).dtype
+        return self.graph.nodes[self.node].dtype
 
     @property
     def is_flag(self) -> bool:
@@ -92,7 +92,7 @@ class Value:
     @property
     def constant(self) -> float | bool | None:
         """The value if it is a constant."""
-        known = self.graph.value(self.cell)
+        known = self.graph.value(self.node)
         return None if known is None else known.item()
 
     @property
@@ -104,7 +104,7 @@ class Value:
         """The value in another type."""
         if self.dtype is dtype:
             return self
-        return Value(self.graph, self.graph.cast(self.cell, np.dtype(dtype)))
+        return Value(self.graph, self.graph.cast(self.node, np.dtype(dtype)))
 
     def taken(self, table: Hashable) -> Value:
         """The value in a table of the graph, of which this is the index."""
@@ -120,12 +120,12 @@ class Value:
         return self.cast(_DOUBLE)._looked_up("interpolate", table, _DOUBLE)
 
     def _looked_up(self, kind: str, table: Hashable, dtype: np.dtype[Any]) -> Value:
-        return Value(self.graph, self.graph.compute(kind, table, (self.cell,), dtype, None))
+        return Value(self.graph, self.graph.compute(kind, table, (self.node,), dtype, None))
 
     __add__ = __radd__ = _operator(np.add)
-    __sub__, __mod__ = _operator(np.subtract), _operator(np.remainder)
+    __sub__, __rsub__ = _operator(np.subtract), _reflected(np.subtract)
     __mul__ = __rmul__ = _operator(np.multiply)
-    __truediv__ = _operator(np.divide)
+    __truediv__, __mod__ = _operator(np.divide), _operator(np.remainder)
     __lt__, __gt__ = _operator(np.less), _operator(np.greater)
     __le__, __ge__ = _operator(np.less_equal), _operator(np.greater_equal)
     # Comparisons make nodes instead of bools, and so there is no hash.
@@ -133,6 +133,9 @@ class Value:
     __and__, __or__ = _operator(np.bitwise_and), _operator(np.bitwise_or)
     __xor__, __rshift__ = _operator(np.bitwise_xor), _operator(np.right_shift)
     __hash__ = None  # type: ignore[assignment]
+
+    def __neg__(self) -> Value:
+        return self.applied(np.negative, self)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *operands: Any, **keywords: Any) -> Any:
         if method != "__call__" or keywords:
@@ -146,8 +149,8 @@ class Value:
         cast = [one.cast(wanted) for one, wanted in zip(values, types, strict=True)]
         if ufunc in _MADE_OF:
             return _MADE_OF[ufunc](*cast)
-        cells = tuple([one.cell for one in cast])
-        return Value(self.graph, self.graph.compute("ufunc", ufunc, cells, dtype, ufunc))
+        operands = tuple([one.node for one in cast])
+        return Value(self.graph, self.graph.compute("ufunc", ufunc, operands, dtype, ufunc))
 
     def beside(self, operand: Any) -> Value:
         """A value or a number as a value of the same graph."""
@@ -168,14 +171,16 @@ def _loop_of(
 def _type_of(number: float | bool) -> np.dtype[Any]:
     if isinstance(number, bool | np.bool_):
         return _FLAG
+    if isinstance(number, np.float32):
+        return _SINGLE
     return _INTEGER if isinstance(number, int | np.integer) else _DOUBLE
 
 
 def where(condition: Value, first: Value | float, second: Value | float) -> Value:
     """The first number where a condition holds, otherwise the second."""
     graph = condition.graph
-    cells = [condition.beside(one).cast(_DOUBLE).cell for one in (first, second)]
-    return Value(graph, graph.choose(condition.cell, *cells))
+    nodes = [condition.beside(one).cast(_DOUBLE).node for one in (first, second)]
+    return Value(graph, graph.choose(condition.node, *nodes))
 
 
 _MADE_OF: Final[Mapping[Any, Callable[[Value], Value]]] = {

@@ -14,6 +14,7 @@ from fmugym.logs import Actions, declared_as
 from fmugym.plant.feed import Feed
 from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
+from fmugym.task.hooks import AssignedHook
 
 __all__ = ["Written"]
 
@@ -40,10 +41,7 @@ class Written:
         self.names = [tag.name for tag in self._tags]
         self.actions = Actions(env, self._range_of, math.inf)
         self._own = env._get_inputs
-        # the hook of this one environment, whatever its class
-        hook, (_, functions) = self._get_inputs, env.inside.formulas
-        env.inside.formulas = None, {**functions, "_get_inputs": hook}
-        env._get_inputs = hook  # type: ignore[method-assign]
+        env._get_inputs = AssignedHook(self._get_inputs)  # type: ignore[method-assign]
         if env.inside.warm_ups is not None:
             warm_up = env.inside.warm_ups.warm_up
             self._of_warm_up = warm_up.inputs

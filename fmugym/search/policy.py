@@ -17,7 +17,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.baselines.arena import Arena, Outcome
-from fmugym.baselines.controller import Controller, FloatArray, attribute_of, limited
+from fmugym.baselines.controller import Controller, FloatArray, attribute_of, either, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.baselines.tuning import numbers_at
 from fmugym.checks import (
@@ -29,6 +29,7 @@ from fmugym.checks import (
     require_regular,
 )
 from fmugym.errors import ConfigError, reading, shown
+from fmugym.expressions.value import Value
 from fmugym.files import write_whole
 from fmugym.search.flattening import choices_of, rows_of
 
@@ -46,8 +47,9 @@ _FADE: Final = 0.05
 _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
 
-Memory = tuple[Any, ...]
-"""What a policy keeps from one step to the next: arrays of numbers, or of symbols."""
+Memory = tuple[FloatArray, ...]
+"""What a policy keeps from one step to the next: the last observation, its leaky integral, and the
+last action."""
 
 
 def scale_of(moments: FloatArray) -> FloatArray:
@@ -252,6 +254,16 @@ class Agent:
         return [part.reshape(-1, *shape) / math.sqrt(shape[0]) for part, shape in pairs]
 
 
+def _change(now: Any, last: Any) -> Any:
+    """The change of an observation since the last step; 0 in the first one, whose last is NaN."""
+    return either(last != last, 0.0, now - last)
+
+
+def _faded(now: Any, last: Any, leaky: Any) -> Any:
+    """The leaky integral of an observation, which begins with the first one."""
+    return either(last != last, now, leaky + _FADE * (now - leaky))
+
+
 _NO_NETWORK: Final = Agent("")
 
 
@@ -326,8 +338,21 @@ class Policy(Controller):
         base = self.middle
         if self.baseline is not None:
             base = self.baseline._decide(rows).reshape(self.count, -1).T
-        action, self._memory = self.step(rows, self._memory, base, self._network)
-        return np.stack(action, axis=-1)
+        return np.stack(self._step(rows, base), axis=-1)
+
+    def _step(self, observed: FloatArray, base: FloatArray) -> list[Any]:
+        """The elements of the action; what ``corrected`` says in formulas."""
+        if not self.agent.acting:
+            return [*base]
+        features = observed[:, : self.agent.observed]
+        if self._memory:
+            last, leaky, told = self._memory
+            change, leaky = _change(observed, last), _faded(observed, last, leaky)
+            features = np.concatenate([observed, change, leaky, told], axis=-1)
+        action = self._with_changes([*base], self._network(features))
+        if self._memory:
+            self._memory = observed, leaky, np.stack(self._told(action), axis=-1)
+        return action
 
     @property
     def moments(self) -> FloatArray:
@@ -349,53 +374,53 @@ class Policy(Controller):
         width = len(self.names)
         return np.full(width, np.nan), np.zeros(width), np.zeros(self.acting)
 
-    def step(
-        self, observed: Any, memory: Memory, base: Any, network: Callable[[Any], Any]
-    ) -> tuple[list[Any], Memory]:
-        """Decide once; all values may be arrays or symbols.
+    def corrected(
+        self,
+        observation: Sequence[Value],
+        memory: Sequence[Sequence[Value]],
+        base: Sequence[Value],
+        network: Callable[[Sequence[Value]], Sequence[Value]],
+    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
+        """The formulas of what the network makes of the controller's decision.
 
         Args:
-            observed: Shape (..., k).
-            memory: What the last step has returned, or ``starts``.
-            base: What the controller has decided: the m elements of the action.
-            network: Gives the m corrections for features of shape (..., f). If actions are
-                discrete, it gives the chosen elements.
+            observation: Its elements.
+            memory: What the network sees of the past, in the order of ``starts``.
+            base: What the controller has decided, the m elements of the action.
+            network: Gives the m corrections, or the chosen elements, for some features.
 
         Returns:
-            The elements of the action, and what to keep.
+            The elements of the action, and what it sees of this step later.
         """
         if not self.agent.acting:
-            return list(base), ()
-        features, *kept = self._features(observed, memory)
-        action = list(network(features))
-        if not self.choices:
-            action = [
-                limited(limited(one, low, high) + (high - low) / 2 * change, low, high)
-                for one, change, (low, high) in zip(base, action, self.limits, strict=True)
-            ]
-        return action, (*kept, self.told(action)) if kept else ()
-
-    def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
-        """What the network sees, and what it shall see of this step in the next one."""
+            return base, ()
         if not memory:
-            return (observed[..., : self.agent.observed],)
+            return self._with_changes(base, network(observation[: self.agent.observed])), ()
         last, leaky, told = memory
-        is_first = np.isnan(last)
-        change = np.where(is_first, 0.0, observed - last)
-        leaky = np.where(is_first, observed, leaky + _FADE * (observed - leaky))
-        return np.concatenate([observed, change, leaky, told], axis=-1), observed, leaky
+        change = list(map(_change, observation, last))
+        leaky = list(map(_faded, observation, last, leaky))
+        action = self._with_changes(base, network([*observation, *change, *leaky, *told]))
+        return action, (observation, leaky, self._told(action))
 
-    def told(self, action: Sequence[Any]) -> Any:
+    def _with_changes(self, base: Sequence[Any], changes: Sequence[Any]) -> list[Any]:
+        """The elements of the action, of what the controller and the network say."""
+        if self.choices:
+            return list(changes)
+        return [
+            limited(limited(one, low, high) + (high - low) / 2 * change, low, high)
+            for one, change, (low, high) in zip(base, changes, self.limits, strict=True)
+        ]
+
+    def _told(self, action: Sequence[Any]) -> list[Any]:
         """The action as the network sees it in the next step.
 
         Numbers go from -1 to 1. Of a choice, the chosen element is 1 and the others are 0.
         """
         if self.choices:
-            told = [one == n for one, all_ in zip(action, self.choices, strict=True) for n in all_]
-        else:
-            pairs = zip(action, self.limits, strict=True)
-            told = [(2.0 * one - low - high) / ((high - low) or 1.0) for one, (low, high) in pairs]
-        return 1.0 * np.stack(told, axis=-1)
+            chosen = zip(action, self.choices, strict=True)
+            return [1.0 * (one == n) for one, choices in chosen for n in choices]
+        limited = zip(action, self.limits, strict=True)
+        return [(2.0 * one - low - high) / ((high - low) or 1.0) for one, (low, high) in limited]
 
     def _network(self, features: FloatArray) -> Any:
         """The outputs for features of shape (N, f), row by row, so that groups do not matter.

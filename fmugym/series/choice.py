@@ -178,7 +178,7 @@ def quantities_of(env: FMUEnv) -> Quantities:
 def _of_config(env: FMUEnv) -> Quantities:
     interface, strings = env.inside.interface, env.fmu.description.strings
     inputs, outputs = interface.inputs, (*interface.outputs, *interface.monitors)
-    episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
+    episode = [n for n, value in env.config.variable_starts.items() if np.ndim(value) == 0]
     parameters = tuple(name for name in interface.parameters if name not in strings)
 
     def read(env: Any) -> Sequence[Any]:

@@ -73,8 +73,8 @@ def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
         action = int(action)  # an element for Gymnasium, but no index for hooks
     if elements is None or type(action) not in _INTEGERS or action not in elements:
         _require_usable(env, action)
-        if inside.quantities is not None and "_get_inputs" in vars(env):
-            action = _of_shape(action, env.action_space)  # the task's own, which reads elements
+        if "_get_inputs" in inside.expressed:
+            action = _of_shape(action, env.action_space)  # expressions read its elements
     before = read.action, read.previous_action, read.previous_state, read.inputs
     read.previous_action, read.previous_state, read.action = read.action, read.state, action
     try:

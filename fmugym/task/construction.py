@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from inspect import getattr_static
@@ -21,14 +21,18 @@ from fmugym.checks import check_mapping
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, support_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name, warn_once
+from fmugym.expressions.by_numpy import hooks_of
+from fmugym.expressions.formulas import Formulas
+from fmugym.expressions.value import Value
 from fmugym.pool import Pool, PoolSpec
 from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
+from fmugym.task.class_formulas import class_formulas, with_monitors
 from fmugym.task.episode import EpisodeDraws
-from fmugym.task.hooks import Hooks, misspelt_hooks
+from fmugym.task.hooks import AssignedHook, Hooks, misspelt_hooks
 from fmugym.task.input_writer import InputWriter
-from fmugym.task.inside import Inside, OwnHooks
+from fmugym.task.inside import Inside, OwnHooks, is_overridden
 from fmugym.task.interface import resolve
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
@@ -83,6 +87,7 @@ class Constructed(Pictured):
         self.render_mode = self._checked_render_mode(render_mode)
         self.fmu = open_fmu(type(self), fmu_path, self.config, self.fmi_interface)
         self._require_fmi_version()
+        self.config = with_monitors(self.config, self.fmu.description)
         self.inside.interface = resolve(self.config, self.fmu.description)
         self.inside.spec = self.inside.interface.pool_spec()
         self.inside.warm_up_steps = self.inside.spec.warm_up_steps
@@ -93,6 +98,7 @@ class Constructed(Pictured):
         self._prepare_values()
         self._prepare_episodes()
         self._prepare_spaces()
+        self._prepare_formulas()
         prepare_hooks(self)
         self.inside.own_names = _names_of(self.inside.base) | vars(self).keys() - foreign
 
@@ -186,7 +192,7 @@ class Constructed(Pictured):
             done=False,
             after_end=False,
             parameters=MappingProxyType(start),
-            variables=EpisodeVariables(self.config.episode_variables),
+            variables=EpisodeVariables(self.config.variable_starts),
         )
 
     def _prepare_episodes(self) -> None:
@@ -206,6 +212,21 @@ class Constructed(Pictured):
                 )
         self.inside.no_action = no_action(self.action_space)
 
+    def _prepare_formulas(self) -> None:
+        inside = self.inside
+        if inside.formulas is None:
+            inside.formulas = class_formulas(self.config, inside.interface, self.action_space)
+            if self.config.terminated is None and not is_overridden(self, inside.base, "_is_done"):
+                raise ConfigError(
+                    f"{type(self).__name__} does not say when the task has ended: give the config "
+                    "key 'terminated', such as 'abs(x) > 1' or 'false', or override _is_done"
+                )
+        if inside.formulas is None:
+            return
+        if self.config.draws_start_time and self.config.stop_time is not None:
+            inside.formulas = _until_stop_time(inside.formulas, self.config, inside.spec)
+        inside.expressed = hooks_of(inside.formulas)
+
 
 def require_construction(env: Constructed) -> None:
     """Refuse an environment whose class has not called the constructor of its base class.
@@ -222,19 +243,17 @@ def prepare_hooks(env: Constructed) -> None:
     """Find out which hooks an environment overrides, and prepare the defaults of the others.
 
     Raises:
-        ConfigError: If a hook is an attribute of the environment; only tasks of expressions have
-            such hooks.
+        ConfigError: If a hook of a step is an attribute of the environment.
     """
     inside, space, base = env.inside, env.observation_space, env.inside.base
     _require_methods(env)
-    inside.own = own = OwnHooks.of(env, base)
     if env.config.draws_start_time and env.config.stop_time is not None:
         _let_stop_time_end_episodes(env)
-        inside.own = own = OwnHooks.of(env, base)
+    inside.own = own = OwnHooks.of(env, base, inside.expressed)
     # A subclass with its own step may take other actions.
     inside.elements = None if own.step else elements_of(env.action_space)
     interface, derived = inside.interface, not own.get_action_space
-    values = fmu_spaces.discrete_values(interface.inputs) if derived else None
+    values = fmu_spaces.discrete_values(interface.chosen_inputs) if derived else None
     inside.action_values = values
     if own.get_action_space and not own.get_inputs:
         fmu_spaces.check_choices(interface.inputs, env.action_space)
@@ -250,10 +269,8 @@ def prepare_hooks(env: Constructed) -> None:
 
 
 def _require_methods(env: Constructed) -> None:
-    known, attributes = env.inside.formulas[1], vars(env)
     for name in (*ORDER, "_goal_reward"):
-        value = attributes.get(name)
-        if value is not known.get(name) and not isinstance(value, _StopTime):
+        if not isinstance(vars(env).get(name), AssignedHook | None):
             raise ConfigError(
                 f"{name} was assigned to an environment of {type(env).__name__}; write this hook "
                 "as a method of the class"
@@ -262,9 +279,17 @@ def _require_methods(env: Constructed) -> None:
 
 def _let_stop_time_end_episodes(env: Constructed) -> None:
     """Each episode has its own last step, as each has its own start time."""
-    hook = env._is_truncated if env.inside.own.is_truncated else None
-    if not isinstance(hook, _StopTime):
-        vars(env)["_is_truncated"] = _StopTime(env, hook)
+    inside, name = env.inside, "_is_truncated"
+    hook, stop_time = env._is_truncated, env.config.stop_time or 0.0
+    is_expressed = name in inside.expressed and not is_overridden(env, inside.base, name)
+    if is_expressed or isinstance(hook, AssignedHook):
+        return
+
+    def is_truncated() -> Any:
+        rest: Any = stop_time - env.time
+        return hook() | (rest < inside.spec.time_step * (1 - 1e-9))
+
+    env._is_truncated = AssignedHook(is_truncated)  # type: ignore[method-assign]
 
 
 def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodeDraws:
@@ -284,7 +309,7 @@ def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> Episo
     return EpisodeDraws(
         tuple((interface.parameter_variables | given_variables).values()),
         {**interface.parameters, **own},
-        env.config.episode_variables,
+        env.config.variable_starts | env.inside.variable_starts,
         own.keys(),
     )
 
@@ -368,18 +393,10 @@ def _step_limit(config: EnvConfig, spec: PoolSpec, warm_up_steps: int) -> int:
     return limit if drawn else min(limit, steps)
 
 
-class _StopTime:
-    """The hook that truncates an episode if another step would pass the stop time.
-
-    Args:
-        env: The environment, whose episodes begin at different times.
-        own: Its own hook that truncates episodes, if it has one.
-    """
-
-    def __init__(self, env: Constructed, own: Callable[[], Any] | None) -> None:
-        self._env, self._own = env, own
-
-    def __call__(self) -> Any:
-        env: Any = self._env
-        is_over = env.config.stop_time - env.time < env.inside.spec.time_step * (1 - 1e-9)
-        return is_over if self._own is None else self._own() | is_over
+def _until_stop_time(formulas: Formulas, config: EnvConfig, spec: PoolSpec) -> Formulas:
+    """The same with the end of episodes that begin at different times."""
+    own = formulas.truncated
+    time, stop_time = Value.read(formulas.graph, "time"), config.stop_time
+    rest: Any = time.beside(stop_time) - time
+    is_over = rest < spec.time_step * (1 - 1e-9)
+    return replace(formulas, truncated=is_over if own is None else own | is_over)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from difflib import get_close_matches
 from inspect import signature
@@ -25,7 +24,7 @@ from fmugym.task.values import NamedValues
 if TYPE_CHECKING:
     from fmugym.rendering import Scene
 
-__all__ = ["Hooks", "misspelt_hooks"]
+__all__ = ["AssignedHook", "Hooks", "misspelt_hooks"]
 
 _ALIKE: Final = 0.85
 """How alike the names of a method and of a hook are if one is meant to be the other."""
@@ -64,7 +63,22 @@ def _with_copied_goals(observation: Any) -> Any:
     return observation | {name: copy(observation[name]) for name in names}
 
 
-class Hooks(gymnasium.Env[Any, Any], ABC):
+class AssignedHook:
+    """A hook of one environment, whatever its class: what the package assigns to the environment.
+
+    Args:
+        call: Does what the hook does.
+    """
+
+    def __init__(self, call: Callable[[], Any]) -> None:
+        self._call = call
+
+    def __call__(self) -> Any:
+        """Do what the hook does."""
+        return self._call()
+
+
+class Hooks(gymnasium.Env[Any, Any]):
     """The hooks with their defaults; a subclass of ``FMUEnv`` overrides what its task needs.
 
     ``FMUEnv`` lists what the hooks may read.
@@ -96,9 +110,13 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         """Turn ``self.action`` into the values of the inputs, in the order of the config.
 
         Returns:
-            One number for each input. By default, these are the elements of the action. For a
-            ``Discrete`` made from an Enumeration or Integer, it is the value of the element.
+            One number for each input. By default, these are the values of ``inputs`` of the config
+            and the elements of the action. For a ``Discrete`` made from an Enumeration or Integer,
+            it is the value of the element.
         """
+        evaluate = self.inside.expressed.get("_get_inputs")
+        if evaluate is not None:
+            return evaluate(self)
         values = self.inside.action_values
         if values is None:
             return self.action
@@ -107,23 +125,41 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         return np.take(values, self.action)
 
     def _update(self) -> None:
-        """Update integrators and filters of the task; called once after each step of the FMU."""
+        """Update integrators and filters of the task; called once after each step of the FMU.
 
-    @abstractmethod
-    def _is_done(self) -> bool:
-        """Whether the task has ended in success or failure; becomes ``terminated``."""
+        By default, the expressions of ``memory`` do so.
+        """
+        evaluate = self.inside.expressed.get("_update")
+        if evaluate is not None:
+            evaluate(self)
 
-    def _is_truncated(self) -> bool:
-        """Whether to cut the episode short for a reason outside the task."""
-        return False
+    def _is_done(self) -> Any:
+        """Whether the task has ended in success or failure; becomes ``terminated``.
+
+        By default, ``terminated`` of the config says so.
+        """
+        evaluate = self.inside.expressed.get("_is_done")
+        return False if evaluate is None else evaluate(self)
+
+    def _is_truncated(self) -> Any:
+        """Whether to cut the episode short for a reason outside the task.
+
+        By default, ``truncated`` of the config says so.
+        """
+        evaluate = self.inside.expressed.get("_is_truncated")
+        return False if evaluate is None else evaluate(self)
 
     def _reward_policy(self) -> Any:
         """The reward of this step.
 
         Returns:
-            By default ``negative_reward`` where the task has ended and ``positive_reward``
-            otherwise. For a goal task, ``_goal_reward`` of this observation.
+            By default ``reward`` of the config; without one, ``negative_reward`` where the task has
+            ended and ``positive_reward`` otherwise. For a goal task, ``_goal_reward`` of this
+            observation.
         """
+        evaluate = self.inside.expressed.get("_reward_policy")
+        if evaluate is not None:
+            return evaluate(self)
         positive, negative = self.config.positive_reward, self.config.negative_reward
         if self.inside.own.goal_reward:
             return self._reward_for_goals(self._get_observation())
@@ -166,14 +202,23 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         """The observation, a new array (or dict of new arrays).
 
         Returns:
-            By default, the outputs in the type of the observation space. If they do not fit that
-            space (an overriding hook may add elements), in the type of their default space.
+            By default, ``observations`` of the config; without them, the outputs in the type of the
+            observation space. If they do not fit that space (an overriding hook may add elements),
+            in the type of their default space.
         """
+        evaluate = self.inside.expressed.get("_get_observation")
+        if evaluate is not None:
+            elements = np.broadcast_arrays(*evaluate(self))
+            return np.array(elements, dtype=self.observation_space.dtype)
         return self.inside.observe(self.state)
 
     def _get_info(self) -> dict[str, Any]:
-        """Additional facts about this step by name, as a new dict."""
-        return {}
+        """Additional facts about this step by name, as a new dict.
+
+        By default, those of ``reward`` with names, ``costs`` and ``info`` of the config.
+        """
+        evaluate = self.inside.expressed.get("_get_info")
+        return {} if evaluate is None else dict(evaluate(self))
 
     # Called once, at construction.
 
@@ -197,6 +242,9 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
     def _explain(self, reward: float) -> str:
         """Say where a reward that is not finite comes from."""
+        if "_reward_policy" in self.inside.expressed:
+            texts = [repr(term["expr"].text) for term in self.config.reward_terms.values()]
+            return f"the reward {' + '.join(texts)} is {reward}"
         return f"_reward_policy returned {reward}"
 
     def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:

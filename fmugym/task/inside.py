@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from threading import RLock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,7 @@ from fmugym.task.warm_up import WarmUps
 if TYPE_CHECKING:
     from fmugym.rendering import Renderer
 
-__all__ = ["Inside", "OwnHooks"]
+__all__ = ["Inside", "OwnHooks", "is_overridden"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,17 +48,28 @@ class OwnHooks:
     get_inputs: bool
 
     @classmethod
-    def of(cls, env: Any, base: type[Any]) -> OwnHooks:
-        """Compare the methods of an environment with those of its base class ``FMUEnv``."""
-        return cls(*[_is_own(env, base, field.name) for field in fields(cls)])
+    def of(cls, env: Any, base: type[Any], expressed: Container[str]) -> OwnHooks:
+        """Compare the methods of an environment with those of its base class ``FMUEnv``.
+
+        Args:
+            env: The environment.
+            base: The class.
+            expressed: The hooks that evaluate an expression, which count as own ones.
+        """
+        names = [name if name in _METHODS else f"_{name}" for name in map(_name_of, fields(cls))]
+        return cls(*[name in expressed or is_overridden(env, base, name) for name in names])
 
     def __contains__(self, hook: str) -> bool:
         """Whether the environment has a hook of its own, by the hook's name."""
         return bool(getattr(self, hook.removeprefix("_")))
 
 
-def _is_own(env: Any, base: type[Any], name: str) -> bool:
-    name = name if name in {"step", "reset"} else f"_{name}"
+_METHODS: Final = ("step", "reset")
+_name_of: Final = attrgetter("name")
+
+
+def is_overridden(env: Any, base: type[Any], name: str) -> bool:
+    """Whether an environment has another method of this name than its base class."""
     found = getattr(env, name)
     return getattr(found, "__func__", found) is not getattr(base, name)
 
@@ -84,12 +96,11 @@ class Inside:
         has_chosen: Whether it is known if there is a player.
         draws: What is drawn for an episode.
         quantities: Lists what a declared task has names for; None for other tasks.
-        formulas: The formulas of a declared task, and the hooks that evaluate them by name; None
-            and nothing if hooks of a class are among them.
+        formulas: What the task computes, as far as expressions say it; None without expressions.
+        expressed: By name, the functions of the environment that evaluate these formulas; the
+            defaults of hooks call them.
         future: What a declared task reads of the future; None for other tasks.
         controllers: Makes the simple controllers of a declared task; None for other tasks.
-        signal_of: Of a declared task: makes a function of observations from an expression and the
-            names of their elements; None for other tasks.
         model: Makes an environment to plan with, where a plant stands in for the FMU; or None.
         held: Returns the outputs that a plant has not told now, whose last values go on.
         own: The hooks that the class has itself.
@@ -108,6 +119,8 @@ class Inside:
         elements: The integers that are actions; None for other spaces.
         action_values: The values of the input for these, if they are others.
         step_limit: The number of steps after which an episode is truncated.
+        variable_starts: By name, what episode variables start with in the place of what the config
+            says.
         warm_ups: What happens in warm-ups with moving inputs, or None.
         warm_up_steps: The steps of a warm-up.
         has_info: Whether a step has an info.
@@ -124,10 +137,10 @@ class Inside:
     base: type
     elements: Any
     ended: bool
-    formulas: tuple[Formulas | None, Mapping[str, Any]]
+    expressed: Mapping[str, Callable[[Any], Any]]
+    formulas: Formulas | None
     future: Future | None
     controllers: Callable[[], list[Any]] | None
-    signal_of: Callable[[str, Sequence[str]], Callable[[Any], Any]] | None
     model: Callable[[], Any] | None
     held: Callable[[], Sequence[str]]
     halt: Callable[[], None]
@@ -165,6 +178,7 @@ class Inside:
     start_inputs: list[tuple[str, float]]
     step_limit: int
     step_pool: Callable[[], int]
+    variable_starts: dict[str, Any]
     warm_up_steps: int
     warm_ups: WarmUps | None
     was_reset: bool
@@ -176,8 +190,8 @@ class Inside:
         self.standing_in = RLock()
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
-        self.formulas = None, {}
-        self.future = self.controllers = self.signal_of = self.model = None
+        self.formulas, self.expressed, self.variable_starts = None, {}, {}
+        self.future = self.controllers = self.model = None
         self.held = lambda: ()
         self.pictured = None, 0.0
         self.readings = NoReadings()  # type: ignore[assignment]  # until there are any

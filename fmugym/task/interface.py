@@ -15,6 +15,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import LARGEST_COUNT
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, unknown_name
+from fmugym.expressions.language import Expression
 from fmugym.pool.spec import (
     FIXED_STEP_SOLVERS,
     START_TIME,
@@ -67,6 +68,17 @@ class Interface:
     def input_names(self) -> tuple[str, ...]:
         """The names of the inputs; arrays are inputs by the names of their elements."""
         return tuple(variable.name for variable in self.inputs)
+
+    @cached_property
+    def expressions_of_inputs(self) -> dict[str, Expression]:
+        """The expressions that write inputs, by the inputs' names."""
+        given, scalars = self.config.inputs, self.description.scalars
+        return {v.name: one for name, one in given.items() for v in scalars(name)}
+
+    @property
+    def chosen_inputs(self) -> tuple[Variable, ...]:
+        """The inputs that the action writes: those without an expression."""
+        return tuple(v for v in self.inputs if v.name not in self.expressions_of_inputs)
 
     @property
     def time_step(self) -> float:
@@ -203,6 +215,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     inputs = _found(description, config.model_input_names, check_input)
     outputs = _found(description, config.model_output_names, check_output)
     read = readable_named(description, config.model_output_names + config.monitor_names)
+    _by_scalar(description, config.inputs, inputs, "input in 'inputs'")  # which knows them all
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
     check_rest_is_known(inputs)
     resolved = _resolved(config, description, inputs + outputs, read)

@@ -1,4 +1,4 @@
-"""What hooks read: numbers for one environment, arrays for N, or symbols in their place."""
+"""What hooks read: numbers for one environment, or arrays for N."""
 
 from __future__ import annotations
 
@@ -29,9 +29,8 @@ __all__ = [
 class Readings:
     """The values that hooks read from their environment.
 
-    Each value has one of three forms. In a single environment it is a number or a tuple of numbers.
-    In a batch of N environments it is an array with the environments on its last axis. While hooks
-    are traced it is a symbol.
+    In a single environment, each value is a number or a tuple of numbers. In a batch of N
+    environments it is an array with the environments on its last axis.
 
     Attributes:
         values: The outputs and the monitored variables.

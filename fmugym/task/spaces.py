@@ -36,7 +36,7 @@ __all__ = [
 
 
 def action_space(interface: Interface) -> spaces.Space[Any]:
-    """Make the action space of an environment's inputs.
+    """Make the action space of the inputs that no expression writes.
 
     Raises:
         ConfigError: If there is no input, or an input has no limits. The text says how to set
@@ -47,14 +47,19 @@ def action_space(interface: Interface) -> spaces.Space[Any]:
             "there are no inputs in 'model_input_names' to make an action space from; "
             "name some, or override _get_action_space"
         )
-    for variable in interface.inputs:
+    if not interface.chosen_inputs:
+        raise ConfigError(
+            "expressions write all inputs, so that there are none to make an action space from; "
+            "override _get_action_space"
+        )
+    for variable in interface.chosen_inputs:
         if variable.kind in {"real", "integer"} and not _bounded(variable):
             raise ConfigError(
                 f"input {variable.name!r} has no min and max in the FMU: give "
                 f"'bounds': {{{variable.name!r}: (low, high)}} in the config, or override "
                 "_get_action_space"
             )
-    return _space(interface.inputs)
+    return _space(interface.chosen_inputs)
 
 
 def check_choices(variables: Sequence[Variable], space: spaces.Space[Any]) -> None:
@@ -81,8 +86,18 @@ def check_choices(variables: Sequence[Variable], space: spaces.Space[Any]) -> No
 
 
 def observation_space(interface: Interface) -> spaces.Space[Any]:
-    """Make the observation space of an environment's outputs. Reals may be unbounded."""
-    return _space(interface.outputs)
+    """Make the observation space of an environment's outputs. Reals may be unbounded.
+
+    Expressions that are observed have no limits, unless they are outputs by their names.
+    """
+    if not interface.config.observations:
+        return _space(interface.outputs)
+    known = {v.name: _range_of(v) for v in interface.outputs + interface.monitors}
+    unlimited = -math.inf, math.inf
+    texts = [one.text.strip() for one in interface.config.observations]
+    with np.errstate(over="ignore"):  # beyond float32 there is no limit
+        limits = np.array([known.get(text, unlimited) for text in texts], dtype=np.float32)
+    return spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
 
 
 def discrete_values(variables: Sequence[Variable]) -> Sequence[int] | None:

@@ -32,7 +32,7 @@ def array_places(names: Iterable[str]) -> dict[str, list[int]]:
 
 
 def stacked(values: Sequence[Any]) -> Any:
-    """Make an array of the elements: numbers, rows of numbers, or symbols in their place."""
+    """Make an array of the elements: numbers, or rows of numbers."""
     return np.array(values) if type(values[0]) is float else np.stack(values)
 
 

@@ -113,7 +113,7 @@ class WarmUps:
 
     def __init__(self, env: Any, warm_up: WarmUp) -> None:
         self._env, self.warm_up = env, warm_up
-        starts = env.config.episode_variables
+        starts = env.config.variable_starts
         self._shapes = {name: np.shape(starts[name]) for name in warm_up.writes}
         sizes = len(env.inside.interface.inputs), *map(math.prod, self._shapes.values())
         self._ends = np.cumsum(sizes)

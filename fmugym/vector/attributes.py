@@ -80,8 +80,6 @@ class Attributes:
         each = self._each(name, values)
         if self.is_parameter(name):
             self._set_parameter(name, each)
-        elif not hasattr(self._prototype, name) and name in self._prototype.variables:
-            self._engine.set_variable(name, self._numbers(name, each))
         else:
             self.set_attribute(name, dict(enumerate(each)))
 
@@ -89,15 +87,15 @@ class Attributes:
         """The values of an episode variable, environments last.
 
         Raises:
-            ConfigError: If they have another shape, or are no numbers.
+            ConfigError: If they have another shape, or are no finite numbers.
         """
         shape = np.shape(take(self._prototype.variables[name], 0))
         try:
             values = np.array([np.broadcast_to(np.asarray(v, np.float64), shape) for v in each])
         except Exception:  # the values are the caller's
-            raise ConfigError(
-                f"{name!r} takes numbers of shape {shape}, got {shown(each)}"
-            ) from None
+            values = np.array(np.nan)
+        if not np.isfinite(values).all():
+            raise ConfigError(f"{name!r} takes numbers of shape {shape}, got {shown(each)}")
         return np.moveaxis(values, 0, -1)
 
     def _each(self, name: str, values: Any) -> list[Any]:
@@ -135,16 +133,24 @@ class Attributes:
             self._engine.set_parameter(variable.name, column)
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
-        """Set an attribute of some environments.
+        """Set an attribute, or an episode variable, of some environments.
 
         Args:
-            name: One that hooks read; expressions read none.
+            name: An attribute that hooks read, or a variable; expressions read no attributes.
             values: By the number of the environment.
 
         Raises:
             ConfigError: If there is no such attribute, or every environment keeps it itself.
         """
         env, names = self._prototype, [*self._prototype.fmu.description.variables]
+        if name in env.variables:
+            drawn = name in env.inside.draws.drawn_names
+            if drawn and len(values) < len(self._engine.ended):
+                raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
+            present = [take(env.variables[name], i) for i in range(len(self._engine.ended))]
+            each = [values.get(index, one) for index, one in enumerate(present)]
+            self._engine.set_variable(name, self._numbers(name, each))
+            return
         names += env.variables
         if self._engine.has_expressions_only:
             what = "parameter or episode variable, which is all that expressions read,"

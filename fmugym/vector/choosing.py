@@ -10,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, warn_once
-from fmugym.expressions.program import UntraceableError
+from fmugym.expressions.program import UncompilableError
 from fmugym.pool import Pool
 from fmugym.pool.extension import has_native_pool
 from fmugym.task.hooks import Hooks
@@ -89,7 +89,7 @@ def _programs(env: FMUEnv) -> TaskPrograms | None:
         return None
     try:
         return compile_formulas(env, formulas)
-    except UntraceableError as reason:
+    except UncompilableError as reason:
         text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
         logger.info("%s. They are evaluated on arrays, which is slower", text)
         return None

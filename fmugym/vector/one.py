@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.expressions.program import UntraceableError
+from fmugym.expressions.program import UncompilableError
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, judged
 from fmugym.task.native_draws import no_draws
@@ -42,7 +42,7 @@ def player_of(env: FMUEnv) -> Player | None:
         return None
     try:
         return Player(env, compile_formulas(env, formulas))
-    except UntraceableError as reason:
+    except UncompilableError as reason:
         text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
         logger.info("%s. They are evaluated in Python, which is slower", text)
         return None

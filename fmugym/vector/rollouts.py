@@ -292,7 +292,7 @@ def keys_of(env: FMUEnv, seed: Any) -> dict[str, float]:
     if first is None or future is None:
         return {}
     stream = np.random.default_rng(first)
-    return {name: env.config.episode_variables[name].sample(stream) for name in future.keys}
+    return {name: env.config.variable_starts[name].sample(stream) for name in future.keys}
 
 
 def _require_tunable(variable: Variable) -> None:

@@ -458,7 +458,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     # Single environments.
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Read an attribute, or else a parameter of the FMU, of each environment.
+        """Read an attribute, an episode variable or a parameter of the FMU, of each environment.
 
         Raises:
             ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
@@ -468,11 +468,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return tuple(self.inside.attributes.read(name, range(self.num_envs)))
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute, or a parameter of the FMU, of each environment.
+        """Set an attribute, an episode variable or a parameter of the FMU, of each environment.
 
         Args:
-            name: An attribute that hooks read, or the name of a parameter; a parameter takes effect
-                with the next episode.
+            name: An attribute that hooks read, or the name of a variable or a parameter. A variable
+                has the value now and at the start of episodes; a parameter takes effect with the
+                next episode. Where only expressions run, there are no attributes to set.
             values: A list or array of one value for each environment, or one value for all. Unless
                 hooks are called one environment at a time, values that differ must be numbers.
 

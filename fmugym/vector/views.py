@@ -27,9 +27,10 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     outputs = np.zeros((len(env.out), count)) if outputs is None else outputs
     space: Any = env.action_space
     action = np.zeros((*space.shape, count), space.dtype)
-    variables = EpisodeVariables(env.config.episode_variables)
-    starts = env.config.episode_variables
-    variables.update({name: np.zeros((*np.shape(starts[name]), count)) for name in variables})
+    variables = EpisodeVariables(env.config.variable_starts)
+    variables.update({n: np.zeros((*np.shape(v), count)) for n, v in variables.items()})
+    starts = env.inside.draws.variable_starts
+    variables.update({n: np.repeat(start, count, axis=-1) for n, start in starts.items()})
     return Readings(
         values=outputs,
         out=env.out.over(lambda: outputs),

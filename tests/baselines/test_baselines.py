@@ -115,6 +115,18 @@ class TestPID:
         assert controller.act(np.array([306.0, 300.0])) == 0
 
 
+def test_signals_may_be_expressions(house):
+    rows = np.random.default_rng(0).uniform(280, 310, (50, 2))
+    mean = Hysteresis("(T_air + T_w) / 2", "T_w - 3", 0.5).bind(house)
+    found = [mean.act(row).item() for row in rows]
+    plain = Hysteresis("T_air", 0.0, 0.5).bind(house)
+    both = np.stack([rows.mean(axis=1) - (rows[:, 1] - 3), rows[:, 1]], axis=-1)
+    assert found == [plain.act(row).item() for row in both]
+    assert set(found) == {0.0, 1.0}
+    with pytest.raises(fmugym.ConfigError, match=r"setpoint: .*'T_wall'.*'T_w'"):
+        PID("T_air", "T_wall - 3", 1.0).bind(house)
+
+
 def test_a_thermostat_switches_at_its_band(house):
     observations, actions = run(house, Hysteresis("T_air", 293.15, 0.5).bind(house), 6 * 96)
     tail = observations[96:, 0]
@@ -274,7 +286,11 @@ class TestMistakes:
             controller.act(np.zeros(3))
 
     def test_observations_without_names(self):
-        env = gym.make("fmugym/Pendulum-v0")
+        class Unnamed(fmugym.envs.PendulumEnv):
+            def _get_observation(self):
+                return super()._get_observation()
+
+        env = Unnamed()
         with pytest.raises(
             fmugym.ConfigError,
             match=r"have no names.*'fmugym new .*Pendulum.fmu --output .*give bind",

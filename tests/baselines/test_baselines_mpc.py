@@ -398,12 +398,19 @@ class TestRefusals:
             bound(**arguments).bind(env_of(task))
 
     def test_of_actions_that_are_several_choices(self, env_of, bound):
-        class Several(CartPoleEnv):
+        class Several(fmugym.FMI2CSEnv):
+            def __init__(self, **options):
+                config = {
+                    "model_input_names": "f",
+                    "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
+                    "time_step": 0.02,
+                    "inputs": {"f": "10 * action[0]"},
+                    "terminated": False,
+                }
+                super().__init__(fmugym.bundled_fmu("CartPole"), config, **options)
+
             def _get_action_space(self):
                 return gymnasium.spaces.MultiDiscrete([2, 2])
-
-            def _get_inputs(self):
-                return 10.0 * self.action[0]
 
         with pytest.raises(
             ConfigError, match="gives one number, but the action space is MultiDiscrete"

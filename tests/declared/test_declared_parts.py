@@ -81,7 +81,7 @@ def test_one_number_has_the_same_value_as_an_element(text):
 
 
 REFUSED = {
-    "a[0]": r"'a\[0\]' cannot stand",
+    "a[0]": "unknown name",
     "[a]": "list",
     "1j": "no number",
     "1e999": "no number",

@@ -2,6 +2,7 @@
 
 import ctypes
 import re
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -78,6 +79,45 @@ TASKS = {
     },
 }  # fmt: skip
 
+FILTERED = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": "50ms",
+    "episode_length": "5s",
+    "parameters": {"theta_0": 0.5, "m": {"distribution": "uniform", "low": 0.9, "high": 1.1}},
+    "variables": {"gain": {"levels": [0.5, 1, 2]}, "way": {"levels": [-1, 0, 1]}},
+    "inputs": {"tau": "gain * way"},
+    "memory": {
+        "slow": {"start": 0, "update": "0.9 * slow + 0.1 * q_dot"},
+        "goal": {"start": {"distribution": "uniform", "low": -1, "high": 1}},
+    },
+    "expressions": {"sine": "sin(q) - goal", "cosine": "cos(q)"},
+    "agent": {"actions": ["gain", "way"], "observations": ["q_dot", "slow", "sine", "cosine"]},
+    "reward": "-abs(q)",
+}
+"""A pendulum with a filter and two actions, one of which is a gain."""
+
+
+class Shifted(fmugym.FMI2CSEnv):
+    """The same as a class, whose choices do not begin with 0."""
+
+    def __init__(self, **keys):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "model_parameters": {"theta_0": 0.5, "m": fmugym.Uniform(0.9, 1.1)},
+            "time_step": 0.05,
+            "max_episode_steps": 100,
+            "inputs": {"tau": "(0.5 if action[0] == 2 else action[0] - 2) * action[1]"},
+            "memory": {"slow": {"start": 0.0, "update": "0.9 * slow + 0.1 * q_dot"}},
+            "episode_variables": {"goal": fmugym.Uniform(-1, 1)},
+            "observations": ["q_dot", "slow", "sin(q) - goal", "cos(q)"],
+            "terminated": False,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config | keys)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.MultiDiscrete([3, 3], start=[2, -1])
+
 
 def heating(name):
     own = TASKS[name]
@@ -134,23 +174,18 @@ class Loops:
             assert worst <= 1e-5
         assert (len(began) > 1) == (times != "constant")
 
-    def test_of_choices_that_do_not_begin_with_0(self, tmp_path):
-        class Shifted(Filtered):
-            def _get_action_space(self):
-                return gymnasium.spaces.MultiDiscrete([3, 3], start=[2, -1])
-
-            def _get_inputs(self):
-                return self.GAINS[self.action[0] - 2] * self.action[1]
-
-        env = Shifted()
+    @pytest.mark.parametrize("make", [lambda: fmugym.load(FILTERED), Shifted])
+    def test_of_several_choices(self, make, tmp_path):
+        env = make()
         network = network_for(env)
         agent = agent_of(env, network)
-        controller, chosen = exported(agent, tmp_path, self.languages[0]), []
+        controller = exported(agent, tmp_path, self.languages[0])
         env.reset(seed=5)
         controller.begin(**drawn_in(env, agent.logic))
+        chosen = []
 
         def act(observation):
-            chosen.append(network.action(np.concatenate([*observation.values()])))
+            chosen.append(network.action(observation))
             return chosen[-1]
 
         assert differences(env, act, agent.logic, controller.step, 50) == (0.0, 0.0, 50)
@@ -170,80 +205,28 @@ class TestClosedLoop(Loops):
         env.close()
 
 
-class Filtered(fmugym.FMI2CSEnv):
-    """A pendulum with hooks by hand: a filter, a table, a dict of observations, two actions."""
+class TestMemory:
+    """What an agent keeps from one sample to the next."""
 
-    GAINS = np.array([0.5, 1.0, 2.0])
-
-    def __init__(self, **more):
-        config = {
-            "model_input_names": "tau",
-            "model_output_names": ["q", "q_dot"],
-            "model_parameters": {"theta_0": 0.5, "m": fmugym.Uniform(0.9, 1.1)},
-            "episode_variables": {"slow": 0.0, "goal": fmugym.Uniform(-1, 1)},
-            "time_step": 0.05,
-            "max_episode_steps": 100,
-        }
-        super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config | more)
-
-    def _get_action_space(self):
-        return gymnasium.spaces.MultiDiscrete([3, 3])
-
-    def _get_observation_space(self):
-        box = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        return gymnasium.spaces.Dict({"speed": box, "angle": box})
-
-    def _get_inputs(self):
-        return self.GAINS[self.action[0]] * (self.action[1] - 1.0)
-
-    def _update(self):
-        self.variables["slow"] = 0.9 * self.variables["slow"] + 0.1 * self.out["q_dot"]
-
-    def _is_done(self):
-        return False
-
-    def _reward_policy(self):
-        return -abs(self.out["q"])
-
-    def _get_observation(self):
-        q, q_dot = self.state
-        angle = np.array([np.sin(q) - self.variables["goal"], np.cos(q)])
-        return {"angle": angle, "speed": np.array([q_dot, self.variables["slow"]])}
-
-
-class TestHooks:
-    """Agents of environments whose hooks are written by hand."""
-
-    def test_kept_values_move_on_together(self, tmp_path):
-        class Delayed(fmugym.FMI2CSEnv):
-            """A pendulum whose agent sees the angle three steps late."""
-
-            def __init__(self):
-                config = {
-                    "model_input_names": "tau",
-                    "model_output_names": ["q"],
-                    "model_parameters": {"theta_0": 0.5},
-                    "episode_variables": {"past": np.zeros(3), "count": 0.0},
-                    "time_step": 0.05,
-                }
-                super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config)
-
-            def _get_observation_space(self):
-                return gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float32)
-
-            def _update(self):
-                past = self.variables["past"]
-                self.variables["past"] = np.concatenate([[self.out["q"]], past[:-1]])
-                self.variables["count"] = self.variables["past"][2] - self.variables["count"]
-
-            def _get_observation(self):
-                kept = self.variables["past"][2], self.variables["count"]
-                return np.array([*kept, self.previous_action[0]])
-
-            def _is_done(self):
-                return False
-
-        env = Delayed()
+    def test_kept_values_move_on_together(self, tmp_path, load):
+        """The agent sees the angle three steps late."""
+        env = load(
+            {
+                "fmu": {"bundled": "Pendulum"},
+                "time_step": "50ms",
+                "episode_length": "5s",
+                "parameters": {"theta_0": 0.5},
+                "memory": {
+                    "first": {"start": 0, "update": "q"},
+                    "second": {"start": 0, "update": "first"},
+                    "third": {"start": 0, "update": "second"},
+                    "count": {"start": 0, "update": "second - count"},
+                },
+                "expressions": {"torque": "previous(tau)"},
+                "agent": {"actions": ["tau"], "observations": ["third", "count", "torque"]},
+                "reward": 1,
+            }
+        )
         network = network_for(env)
         agent = agent_of(env, network)
         controller = compiled(agent, tmp_path)
@@ -251,10 +234,9 @@ class TestHooks:
         observation, _ = env.reset(seed=0)
         controller.begin()
         for _ in range(50):
-            actions = controller.step(env.state)
+            actions = controller.step(env.state[:1])
             observation, *_ = env.step(network.action(observation))
             assert actions == pytest.approx(env.inputs, abs=1e-6)
-        env.close()
 
     @pytest.mark.parametrize("env_id", ["CartPole", "House"])
     def test_an_environment_that_runs_compiled(self, env_id, tmp_path):
@@ -279,12 +261,11 @@ class TestHooks:
         env.close()
         other.close()
 
-    def test_what_was_drawn_is_a_parameter(self):
-        env = Filtered()
+    def test_what_was_drawn_is_a_parameter(self, load):
+        env = load(FILTERED)
         logic = agent_of(env, network_for(env)).logic
-        assert [one.name for one in logic.parameters] == ["goal"]  # no hook reads the mass
+        assert [one.name for one in logic.parameters] == ["goal"]  # nothing reads the mass
         assert [kept.name for kept in logic.kept] == ["slow", "goal"]
-        env.close()
 
     def test_a_hidden_state_is_refused(self, load):
         task = HEATING | {"agent": PRESENT | {"observations": ["rate"]}}
@@ -293,29 +274,78 @@ class TestHooks:
         with pytest.raises(ConfigError, match=r"'der_T_m'.*'local'"):
             agent_of(env, network_for(env))
 
+
+class Plain(fmugym.FMI2CSEnv):
+    """A pendulum whose only hooks are those that no controller needs."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "episode_variables": {"slow": 0.0},
+            "time_step": 0.05,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config)
+
+    def _is_done(self):
+        return bool(abs(self.out["q"]) > 9)
+
+    def _reward_policy(self):
+        return -float(np.linalg.norm(self.state))
+
+
+def observe(self):
+    return self.state / 2
+
+
+def update(self):
+    self.variables["slow"] = 0.9 * self.variables["slow"]
+
+
+class TestHooks:
+    """Hooks are Python, which no controller runs."""
+
+    def test_those_of_rewards_and_ends_are_not_needed(self, tmp_path):
+        with closing(Plain()) as env:
+            network = network_for(env)
+            agent = agent_of(env, network)
+            measured, written, steps = closed_loop(env, acting(network), agent, tmp_path, 50)
+        assert measured <= 1e-3
+        assert written <= 1e-3
+        assert steps == 50
+
     @pytest.mark.parametrize(
         ("hooks", "fact"),
         [
-            ({"step": lambda self, action: None}, "step"),
-            ({"_get_observation": lambda self: float(self.state[0])}, "_get_observation"),
-            ({"_get_inputs": lambda self: [0.0]}, "input"),
+            ({"step": lambda self, action: None}, "step is overridden"),
+            ({"_get_inputs": lambda self: 2 * self.action}, "_get_inputs is .* 'inputs'"),
+            ({"_update": update}, "_update is .* 'memory'"),
+            ({"_get_observation": observe}, "_get_observation is .* 'observations'"),
         ],
-    )  # fmt: skip
-    def test_what_cannot_be_is_refused(self, hooks, fact):
-        env = type("Odd", (Filtered,), hooks)()
-        with pytest.raises(ConfigError, match=fact):
+    )
+    def test_others_are_refused(self, hooks, fact):
+        odd = type("Odd", (Plain,), hooks)
+        with closing(odd()) as env, pytest.raises(ConfigError, match=f"Odd.*{fact}"):
             agent_of(env, network_for(env))
-        env.close()
+
+    def test_of_a_task_that_has_a_reward_in_python(self):
+        class Rewarding(fmugym.TaskEnv):
+            def _reward_policy(self):
+                return -float(np.linalg.norm(self.state))
+
+        with closing(Rewarding(HEATING | {"agent": PRESENT})) as env:
+            assert [v.name for v in agent_of(env, network_for(env)).logic.measurements] == ["T_op"]
 
     def test_the_end_of_an_episode_is_not_known_to_a_controller(self):
-        def observation(self):
-            angle = np.array([np.where(self.done, 1.0, 0.0), self.state[0]])
-            return {"angle": angle, "speed": angle}
-
-        env = type("Odd", (Filtered,), {"_get_observation": observation})()
-        with pytest.raises(ConfigError, match="done"):
+        env = Shifted(observations=["1 if done else 0", "q"])
+        with closing(env), pytest.raises(ConfigError, match="'done'"):
             agent_of(env, network_for(env))
-        env.close()
+
+    def test_one_that_is_assigned_is_refused(self, load):
+        env = load(HEATING | {"agent": PRESENT})
+        env._get_inputs = lambda: [1.0]
+        with pytest.raises(ConfigError, match="_get_inputs is a function of Python"):
+            agent_of(env, network_for(env))
 
 
 class TestSensors:
@@ -372,11 +402,9 @@ class TestExternal:
             agent_of(env, network_for(env), external=[name])
         env.close()
 
-    def test_hooks_by_hand_have_no_data(self):
-        env = Filtered()
-        with pytest.raises(ConfigError, match="task file"):
-            agent_of(env, network_for(env), external=["goal"])
-        env.close()
+    def test_classes_have_no_data(self):
+        with closing(Plain()) as env, pytest.raises(ConfigError, match="task file"):
+            agent_of(env, network_for(env), external=["price"])
 
 
 def test_powers_are_those_of_c(tmp_path):

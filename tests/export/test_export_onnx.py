@@ -20,8 +20,8 @@ from export_tools import (
     network_for,
     network_with,
 )
-from test_export import Filtered, heating
-from test_export_search import HEATERS, PID, heater
+from test_export import heating
+from test_export_search import HEAT, HEATERS, heater
 
 from fmugym import ConfigError
 from fmugym.export import agent_of, write_onnx
@@ -52,26 +52,13 @@ class TestEpisodes(test_export.Loops):
             assert actions[0] == pytest.approx(env.inputs[0], abs=1e-5)
         env.close()
 
-    def test_of_hooks_by_hand(self, tmp_path):
-        env = Filtered()
-        network = network_for(env)
-        runner = exported(agent_of(env, network), tmp_path, "ONNX")
-        observation, _ = env.reset(seed=5)
-        runner.begin(goal=env.variables["goal"])
-        for _ in range(50):
-            action = network.action(np.concatenate([observation["angle"], observation["speed"]]))
-            gain = [0.5, 1.0, 2.0][action[0]]
-            assert runner.step(env.state).item() == pytest.approx(gain * (action[1] - 1.0))
-            observation, *_ = env.step(action)
-        env.close()
-
 
 class TestSearch(test_export_search.Agents):
-    language = "ONNX"
+    language, tolerance = "ONNX", 1e-8
 
     def test_the_memory_is_json_without_nan(self, tmp_path):
         env = heater(HEATERS["a controller"][0])
-        path = write_onnx(agent_of(env, Agent("by hand", PID)), tmp_path / "agent.onnx")
+        path = write_onnx(agent_of(env, Agent("by hand", HEAT)), tmp_path / "agent.onnx")
         facts = runtime.InferenceSession(str(path)).get_modelmeta().custom_metadata_map
         assert json.loads(facts["memory"])["agent_controller"] == [0.0, None]
         env.close()

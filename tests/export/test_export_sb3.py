@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from export_tools import closed_loop, compiled, made
 from fmpy.validation import validate_fmu
-from test_export import Filtered
+from test_export import FILTERED
 
+import fmugym
 from fmugym import ConfigError
 from fmugym.export import Scaling, agent_of, network_of
 from fmugym.export.policies import network_of_model
@@ -36,6 +37,10 @@ def algorithm(name):
 def model_of(name, env, **more):
     keywords = {"policy_kwargs": dict(SMALL.get(name, {})), "device": "cpu", "seed": 0} | more
     return algorithm(name)("MlpPolicy", env, **keywords)
+
+
+def filtered():
+    return fmugym.load(FILTERED)
 
 
 def predicting(model, normalization=None):
@@ -98,24 +103,19 @@ class TestClosedLoop:
         env.close()
         venv.close()
 
-    def test_dicts_of_observations_and_several_actions(self, tmp_path):
+    def test_several_actions(self, tmp_path):
         from stable_baselines3.common.vec_env import VecNormalize
 
         from fmugym.sb3 import make_sb3_env
 
-        venv = VecNormalize(make_sb3_env(Filtered, 2, seed=0), norm_obs_keys=["angle"])
-        model = sb3.PPO("MultiInputPolicy", venv, device="cpu", n_steps=64, batch_size=64)
+        venv = VecNormalize(make_sb3_env(filtered, 2, seed=0))
+        model = model_of("PPO", venv, n_steps=64, batch_size=64)
         model.learn(256)
         venv.training = False
-        env = Filtered()
-        controller = compiled(agent_of(env, model, venv), tmp_path)
-        observation, _ = env.reset(seed=0)
-        controller.begin(goal=env.variables["goal"])
-        for _ in range(100):
-            action, _ = model.predict(venv.normalize_obs(observation), deterministic=True)
-            inputs = controller.step(env.state)
-            observation, *_ = env.step(action)
-            assert inputs == pytest.approx(env.inputs)
+        env = filtered()
+        agent = agent_of(env, model, venv)
+        played = closed_loop(env, predicting(model, venv), agent, tmp_path)
+        assert played == (0.0, 0.0, 100)
         env.close()
         venv.close()
 
@@ -173,6 +173,13 @@ class TestRefused:
         env = Pretend(space, gymnasium.spaces.Discrete(2))
         model = sb3.PPO("CnnPolicy", env, device="cpu")
         with pytest.raises(ConfigError, match="NatureCNN"):
+            network_of_model(model)
+
+    def test_a_policy_that_observes_a_dict(self):
+        space = gymnasium.spaces.Dict({"angle": gymnasium.spaces.Box(-1, 1, (2,))})
+        env = Pretend(space, gymnasium.spaces.Discrete(2))
+        model = sb3.PPO("MultiInputPolicy", env, device="cpu")
+        with pytest.raises(ConfigError, match=r"Dict.*a Box can be"):
             network_of_model(model)
 
     @pytest.mark.parametrize(

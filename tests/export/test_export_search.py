@@ -10,13 +10,15 @@ import pytest
 from combinations import in_turn
 from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
-from test_export import HEATING, PRESENT, TASKS, Filtered
+from test_export import HEATING, PRESENT, TASKS, Shifted
 from test_export_fmu import controller_of, sampling
 
 import fmugym
-from fmugym import ConfigError
+from fmugym import ConfigError, bundled_fmu
+from fmugym.baselines import LQR, PID, Hysteresis
 from fmugym.baselines import controller_of as controller_from
 from fmugym.export import agent_of, write_c, write_fmu
+from fmugym.linearization import linearize
 from fmugym.search.policy import Agent, Policy
 
 UNSCALED = np.array([[0.0], [1.0]])
@@ -26,16 +28,16 @@ PAIR = {
     "variables": HEATING["variables"] | {"gains": {"name": "Q_int", "min": 0, "max": 500}},
     "agent": PRESENT | {"actions": ["u", "gains"]},
 }
-PID = "pid of=T setpoint=21 kp=0.1 ti=7200 td=300"
+HEAT = "pid of=T setpoint=21 kp=0.1 ti=7200 td=300"
 SWITCH = "hysteresis of=T setpoint=21 band=0.3 below=0.8 above=0.2"
 HEATERS = {
     "a controller": (TASKS["set point"], "pid of=T setpoint=T_set kp=0.3 ti=20000 td=60", None),
-    "a controller and a history": (TASKS["history"], PID, HISTORY),
-    "forecasts": (TASKS["forecast"], PID, LINEAR),
+    "a controller and a history": (TASKS["history"], HEAT, HISTORY),
+    "forecasts": (TASKS["forecast"], HEAT, LINEAR),
     "a switch": ({"agent": PRESENT}, SWITCH, LINEAR),
-    "a change": (TASKS["change"], PID, HISTORY),
+    "a change": (TASKS["change"], HEAT, HISTORY),
     "a rate": (TASKS["rate"], None, HISTORY),
-    "levels": (TASKS["levels"], PID, LINEAR),
+    "levels": (TASKS["levels"], HEAT, LINEAR),
     "memory": (TASKS["memory"], None, Agent("by hand", None, 1, 1, hidden=8)),
     "two actions": (PAIR, None, Agent("by hand", None, 1, 1, hidden=16, history=True)),
 }  # fmt: skip
@@ -97,8 +99,48 @@ def require_same(both, different=8):
     np.testing.assert_allclose(own, wanted, rtol=1e-9, atol=1e-12)
 
 
+BALANCED = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": "20ms",
+    "episode_length": "5s",
+    "parameters": {"q_0": "pi", "theta_0": 0.05},
+    "variables": {"tau": {"min": -0.05, "max": 0.05}},
+    "agent": {"actions": ["tau"], "observations": ["theta", "theta_dot"]},
+    "reward": 1,
+}
+CONTROLLERS = {
+    "PID": lambda: PID("theta", 0.0, kp=np.array([-0.02]), ti=3.0, td=0.1, offset=0.001),
+    "PID of expressions": lambda: PID(
+        "sin(theta)", "theta_dot / 9 if theta > 0 else max(0, theta)", -0.03, ti=1.0
+    ),
+    "hysteresis": lambda: Hysteresis("theta", 0.0, 0.5, below=0.04, above=-0.02),
+    "hysteresis of expressions": lambda: Hysteresis("theta", "theta_dot / 3", 0.5, 0.04, -0.02),
+    "LQR": lambda: LQR(linearize(bundled_fmu("Pendulum"), at={"q_0": np.pi}), [1, 0.1], [90]),
+}
+
+
 class Agents:
     """The exported agent, beside its Python policy in an episode."""
+
+    tolerance = 0.0
+
+    @pytest.mark.parametrize("name", CONTROLLERS)
+    def test_of_controllers(self, name, tmp_path, load):
+        if name == "LQR":
+            pytest.importorskip("scipy", reason="needs the extra 'identification'")
+        env = load(BALANCED, physical=True)
+        controller = CONTROLLERS[name]()
+        agent = agent_of(env, controller)
+        made = exported(agent, tmp_path, self.language)
+        made.begin()
+        controller.bind(env)
+        places = [env.observation_names.index(one.name) for one in agent.logic.measurements]
+        wanted, found = [], []
+        for row in np.random.default_rng(0).normal(size=(200, 2)):
+            wanted.append(controller.act(row.astype(np.float32)).tolist())
+            found.append([*made.step(row[places])])
+        assert len(np.unique(wanted)) >= (2 if "hysteresis" in name else 50)
+        assert found == pytest.approx(np.array(wanted), abs=self.tolerance)
 
     @pytest.mark.parametrize("task", HEATERS)
     def test_of_task_files(self, task, tmp_path):
@@ -157,7 +199,7 @@ class Agents:
 
     def test_a_second_episode_begins_as_the_first_one(self, tmp_path):
         env = heater(TASKS["history"])
-        agent = agent_for(env, PID, HISTORY)
+        agent = agent_for(env, HEAT, HISTORY)
         controller = exported(agent_of(env, agent), tmp_path, self.language)
         runs = []
         for _ in range(2):
@@ -171,8 +213,8 @@ class Agents:
 class TestInC(Agents):
     language = "C99"
 
-    def test_of_hooks_by_hand_with_several_choices(self, tmp_path):
-        env = Filtered()
+    def test_of_several_choices(self, tmp_path):
+        env = Shifted()
         agent = agent_for(env, None, HISTORY)
         env.reset(seed=1)
         controller = compiled(agent_of(env, agent), tmp_path, "C++")
@@ -182,9 +224,9 @@ class TestInC(Agents):
 
     def test_of_a_controller_in_python(self, tmp_path):
         env, texts = heater({"agent": PRESENT}), []
-        policy = Agent("by hand", PID).policy().bind(env)
+        policy = Agent("by hand", HEAT).policy().bind(env)
         policy.act(np.array([20.0, 1.0]))
-        for model in (policy, controller_from(PID), Agent("by hand", PID)):
+        for model in (policy, controller_from(HEAT), Agent("by hand", HEAT)):
             folder = tmp_path / str(len(texts))
             folder.mkdir()
             texts.append(write_c(agent_of(env, model), folder)[1].read_text())
@@ -219,29 +261,15 @@ class TestRefused:
     def test_a_task_in_the_form_for_agents(self, load):
         env = load(HEATING | {"agent": PRESENT})
         with pytest.raises(ConfigError, match=r"physical"):
-            agent_of(env, Agent("by hand", PID))
+            agent_of(env, Agent("by hand", HEAT))
 
     def test_another_task(self):
         env, other = heater({"agent": PRESENT}), heater(TASKS["forecast"])
-        agent = agent_for(other, PID, HISTORY)
+        agent = agent_for(other, HEAT, HISTORY)
         with pytest.raises(ConfigError, match=r"another task.*price\[\+"):
             agent_of(env, agent)
         env.close()
         other.close()
-
-    def test_what_is_no_box(self):
-        class Choosing(Filtered):
-            def _get_observation_space(self):
-                return gymnasium.spaces.Discrete(2)
-
-            def _get_observation(self):
-                return np.int64(self.state[0] > 0)
-
-        env = Choosing()
-        agent = agent_for(env, None, LINEAR)
-        with pytest.raises(ConfigError, match=r"Discrete\(2\).*Box"):
-            agent_of(env, agent)
-        env.close()
 
 
 def test_by_the_command_line(tmp_path, ran, load):

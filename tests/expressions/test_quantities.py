@@ -28,7 +28,10 @@ TASK = {
     },
     "terminated": "step > 18",
 }
-"""A term for each quantity but the inputs, for which expressions read the actions here."""
+"""A term for each quantity but those of ``ELSEWHERE``."""
+
+ELSEWHERE = {"inputs", "after_end"}
+"""Task files have the actions in the place of inputs. Only classes go on after an end."""
 
 KEYS = {
     **dict.fromkeys(("outputs", "previous_outputs", "action", "previous_action"), 0),
@@ -38,7 +41,7 @@ KEYS = {
 
 
 def test_each_has_a_term():
-    assert {*TASK["reward"], "inputs"} == set(QUANTITIES)
+    assert {*TASK["reward"], *ELSEWHERE} == set(QUANTITIES)
 
 
 @pytest.mark.parametrize("hooks", ["expressions", "Python"])

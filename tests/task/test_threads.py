@@ -29,7 +29,7 @@ def calls_of(env, snapshot):
     return [
         env.reset,
         *[lambda: env.step(1)] * 3,
-        lambda: setattr(env, "force_mag", 10.0),
+        lambda: env.variables.update(force_mag=10.0),
         lambda: env.variables.copy(),
         env.save_state,
         lambda: env.restore_state(snapshot),

@@ -295,7 +295,7 @@ def test_a_class_without_is_done(probe):
     class Unfinished(fmugym.FMUEnv):
         pass
 
-    with pytest.raises(TypeError, match="_is_done"):
+    with pytest.raises(ConfigError, match=r"'terminated', .*, or override _is_done"):
         Unfinished(probe(2), probe_config())
 
 

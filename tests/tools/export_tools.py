@@ -26,10 +26,7 @@ def network_for(env, hidden=(16, 16), scaled=True, squashed=False, seed=0, activ
     """A network with random weights for the spaces of an environment."""
     rng = np.random.default_rng(seed)
     space = env.action_space
-    count = sum(
-        int(np.prod(s.shape))
-        for s in getattr(env.observation_space, "spaces", {"": env.observation_space}).values()
-    )
+    count = int(np.prod(env.observation_space.shape))
     if isinstance(space, spaces.Box):
         last = int(np.prod(space.shape))
     else:

@@ -36,16 +36,15 @@ def in_way(way, make):
 
 def _made(way, make, *given, **options):
     env = make(*given, **options)
-    assert way != EXPRESSIONS or env.inside.formulas[0] is not None
+    assert way != EXPRESSIONS or env.inside.formulas is not None
     if way not in (None, EXPRESSIONS):
-        env.inside.formulas = None, env.inside.formulas[1]
         env.__class__ = declared(type(env), way)
     return env
 
 
 def in_python(env):
     """Evaluate the expressions of an environment in Python; for the time before its first reset."""
-    env.inside.formulas = None, env.inside.formulas[1]
+    env.inside.formulas = None
     return env
 
 

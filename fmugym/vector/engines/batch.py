@@ -96,6 +96,7 @@ class BatchEngine(Engine):
         self._busy: MaskArray | None = None
         self._all = np.ones(num_envs, np.bool_)
         self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
+        self._variable_starts: dict[str, FloatArray] = {}
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
@@ -151,12 +152,15 @@ class BatchEngine(Engine):
         Python does so where others step the FMUs, where it has to draw values or to set episode
         variables, where something goes with resets, and where constants are not the usual ones.
         """
-        self._pool_starts = self._may_start and not self._any_foreign
+        is_usual = not self._any_foreign and not self._variable_starts
+        self._pool_starts = self._may_start and is_usual
         self._starts_at_ends = self._pool_starts and not self._calls_hooks
 
     def set_variable(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_variable``."""
         self._place({name: values}, slice(None))
+        self._variable_starts[name] = values
+        self._settle_starts()
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
@@ -363,6 +367,8 @@ class BatchEngine(Engine):
         """Write the values of episodes into the rows of the parameters and variables."""
         constants = draws.constant_parameters
         self._place(draws.variable_starts | constants | draws.named(drawn), indices)
+        for name, values in self._variable_starts.items():
+            self._place({name: values[..., indices]}, indices)
         own = constants.keys() - draws.told.keys()
         self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
         for name, numbers in self._numbers_of_told_texts(draws, drawn).items():

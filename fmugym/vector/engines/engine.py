@@ -180,7 +180,7 @@ class Engine(ABC):
 
     @abstractmethod
     def set_variable(self, name: str, values: FloatArray) -> None:
-        """Give an episode variable one value for each environment, in its present episode.
+        """Give an episode variable one value for each environment, now and at each start.
 
         Args:
             name: The variable.

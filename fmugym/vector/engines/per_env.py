@@ -106,7 +106,8 @@ class PerEnvEngine(Engine):
     def set_variable(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_variable``."""
         for index, env in enumerate(self._envs):
-            env.variables[name] = take(values, index)
+            env.variables[name] = env.inside.variable_starts[name] = take(values, index)
+            env.inside.draws = draws_of(env)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""

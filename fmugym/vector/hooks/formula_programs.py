@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.expressions.formulas import Formulas
-from fmugym.expressions.graph import Cell, Graph
+from fmugym.expressions.formulas import Formulas, Update
+from fmugym.expressions.graph import Graph
 from fmugym.expressions.lowering import Store, compile_graph
-from fmugym.expressions.program import Program, UntraceableError, letter_of
+from fmugym.expressions.program import Program, UncompilableError, letter_of
 from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
+from fmugym.task.inside import is_overridden
 from fmugym.task.step import ORDER
 from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
 
-__all__ = ["compile_formulas", "formulas_of"]
+__all__ = ["Translation", "compile_formulas", "formulas_of", "written_variables"]
 
 _DOUBLE: Final = np.dtype(np.float64)
 _FLAG: Final = np.dtype(np.bool_)
@@ -28,14 +29,11 @@ _Seen = tuple[SeenArray, list[Value]]
 
 
 def formulas_of(env: FMUEnv) -> Formulas | None:
-    """The formulas that the hooks of an environment are; None if one of them is another function.
-
-    A function that is assigned to a hook later takes the place of its formula.
-    """
-    formulas, functions = env.inside.formulas
-    assigned = vars(env)
-    is_same = all(assigned.get(name) is functions.get(name) for name in ORDER)
-    return formulas if is_same else None
+    """The formulas that all hooks of a step are; None if the class overrides one of them."""
+    inside = env.inside
+    hooks = (*ORDER, "_goal_reward")
+    is_own = any(is_overridden(env, inside.base, hook) for hook in hooks)
+    return None if is_own else inside.formulas
 
 
 def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
@@ -46,10 +44,10 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
         formulas: What the task computes.
 
     Raises:
-        UntraceableError: If programs do not have its actions or observations, or it is too long.
+        UncompilableError: If programs do not have its actions or observations, or it is too long.
     """
     if env.inside.pool_tells:
-        raise UntraceableError("the pool tells infos of its own")
+        raise UncompilableError("the pool tells infos of its own")
     letter_of(np.dtype(env.action_space.dtype))
     judgement, seen, updated = _Judgement(env, formulas).made()
     types = dict.fromkeys(env.variables, _DOUBLE)
@@ -59,22 +57,19 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
 def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
     """The program from the action to the inputs."""
     graph = Graph()
-    values = _Translation(env, graph, has_stepped=False)
-    given = formulas.inputs
-    inputs = values.elements_of_action() if given is None else map(values.of, given)
-    variables = env.inside.interface.inputs
-    typed = [to_input_type(v, value.number) for v, value in zip(variables, inputs, strict=True)]
-    return compile_graph(graph, [Store(v.node, ("input", i)) for i, v in enumerate(typed)], [], 0)
+    inputs = Translation(env, graph, has_stepped=False).inputs(formulas)
+    return compile_graph(graph, [Store(v.node, ("input", i)) for i, v in enumerate(inputs)], [], 0)
 
 
-class _Translation:
+class Translation:
     """From the graph of a task to that of a program.
 
     Args:
         env: An environment of the task.
         graph: That of the program.
         has_stepped: Whether the FMU has stepped.
-        known: Those that are no rows any more: the variables that are written, and ``done``.
+        known: Quantities that are no rows any more, by name and keys: the variables that are
+            written, and ``done``; actions by their element.
     """
 
     def __init__(
@@ -86,24 +81,47 @@ class _Translation:
     ) -> None:
         self._env, self._graph, self._has_stepped = env, graph, has_stepped
         self._known = {} if known is None else known
-        self._cells: dict[int, Cell] = {}
+        self._nodes: dict[int, int] = {}
 
     def of(self, value: Value) -> Value:
         """The same value in the graph of the program."""
         source = value.graph
-        for number in source.needed([value.node], self._cells):
-            if number not in self._cells:
+        for number in source.needed([value.node], self._nodes):
+            if number not in self._nodes:
                 kind, what, operands, dtype = source.nodes[number]
                 if kind == "row":
-                    self._cells[number] = self._read(what).cast(dtype).cell
+                    self._nodes[number] = self._read(what).cast(dtype).node
                     continue
                 if kind in ("take", "interpolate"):
                     self._graph.tables[what] = source.tables[what]
-                cells = tuple(self._cells[one] for one in operands)
-                self._cells[number] = self._graph.add(kind, what, cells, dtype)
-        return Value(self._graph, self._cells[value.node])
+                own = tuple(self._nodes[one] for one in operands)
+                self._nodes[number] = self._graph.add(kind, what, own, dtype)
+        return Value(self._graph, self._nodes[value.node])
 
-    def elements_of_action(self) -> list[Value]:
+    def inputs(self, formulas: Formulas) -> list[Value]:
+        """The FMU's inputs, each rounded to its type."""
+        given = formulas.inputs
+        inputs = self._elements_of_action() if given is None else map(self.of, given)
+        variables = self._env.inside.interface.inputs
+        return [to_input_type(v, value.number) for v, value in zip(variables, inputs, strict=True)]
+
+    def observation(self, formulas: Formulas) -> list[Value]:
+        """The elements of the observation, in the type of their space.
+
+        Raises:
+            UncompilableError: If the space is no array of numbers.
+        """
+        space: Any = self._env.observation_space
+        if not isinstance(space, spaces.Box | spaces.MultiBinary):
+            raise UncompilableError(f"programs make no observations of {space}")
+        if formulas.observation is None:
+            count = self._env.inside.output_count
+            elements = [self.quantity("outputs", place) for place in range(count)]
+        else:
+            elements = [self.of(one) for one in formulas.observation]
+        return [one.cast(space.dtype) for one in elements]
+
+    def _elements_of_action(self) -> list[Value]:
         """The numbers that the default of ``_get_inputs`` gives."""
         space, values = self._env.action_space, self._env.inside.action_values
         count = int(np.prod(space.shape or (), dtype=int))
@@ -120,11 +138,14 @@ class _Translation:
         return self._read((name, *keys))
 
     def _row(self, *what: Any, dtype: np.dtype[Any] = _DOUBLE) -> Value:
-        return Value(self._graph, self._graph.load("row", what, dtype, None))
+        return Value(self._graph, self._graph.load("row", what, dtype))
 
     def _loaded(self, attribute: str, index: int) -> Value:
+        known = self._known.get((attribute, index))
+        if known is not None:
+            return known
         dtype = np.dtype(self._env.action_space.dtype)
-        return Value(self._graph, self._graph.load(attribute, index, dtype, None))
+        return Value(self._graph, self._graph.load(attribute, index, dtype))
 
     def _read(self, what: Any) -> Value:
         """What an environment has, see ``Value.read``."""
@@ -135,10 +156,12 @@ class _Translation:
             return self._loaded(name, keys[0] if keys else 0)
         if name == "time":
             return self._time()
+        if name == "after_end":
+            return Value.of(self._graph, False)
         quantity = QUANTITIES[name]
         kind = quantity.after if self._has_stepped else quantity.before
         if kind is None:
-            raise UntraceableError(f"it reads {name!r} before there is one")
+            raise UncompilableError(f"it reads {name!r} before there is one")
         place = keys.pop() if keys and isinstance(keys[-1], int) else 0
         return self._row(kind, *keys, place, dtype=quantity.dtype)
 
@@ -150,6 +173,33 @@ class _Translation:
             start = self._row("parameter", "start_time", 0)
         count: Value = (self.quantity("step_count") + env.inside.warm_up_steps) * spec.substeps
         return count * spec.time_step / spec.substeps + start
+
+
+def written_variables(
+    env: FMUEnv, graph: Graph, updates: Sequence[Update]
+) -> dict[tuple[Any, ...], Value]:
+    """What updates write to episode variables; environments that have not stepped keep theirs.
+
+    Args:
+        env: An environment of the task.
+        graph: That of the program.
+        updates: See ``Formulas``.
+
+    Returns:
+        The values by ``("variables", name)``, and the place of an element if there are several.
+    """
+    written: dict[tuple[Any, ...], Value] = {}
+    for update in updates:
+        values = Translation(env, graph, True, dict(written))
+        for name, value in update.items():
+            if isinstance(value, Value):
+                written["variables", name] = values.of(value).number
+                continue
+            for place, one in enumerate(value):
+                written["variables", name, place] = values.of(one).number
+    before = Translation(env, graph, True)
+    is_active = Value(graph, graph.load("active", None, _FLAG))
+    return {key: where(is_active, value, before.quantity(*key)) for key, value in written.items()}
 
 
 class _Judgement:
@@ -188,34 +238,21 @@ class _Judgement:
         program = compile_graph(graph, stores + more, results, len(seen))
         return program, tuple(array for array, _ in seen), updated
 
-    def _values(self) -> _Translation:
-        return _Translation(self._env, self._graph, True, dict(self._known))
+    def _values(self) -> Translation:
+        return Translation(self._env, self._graph, True, dict(self._known))
 
     def _told(self, kind: str) -> Value:
         """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
-        return Value(self._graph, self._graph.load(kind, None, _FLAG, None))
+        return Value(self._graph, self._graph.load(kind, None, _FLAG))
 
     def _update(self) -> tuple[list[Store], tuple[str, ...]]:
-        """Write variables; environments that have not stepped keep theirs."""
-        written: dict[str, None] = {}
-        for update in self._formulas.updates:
-            values = self._values()
-            for name, value in update.items():
-                written[name] = None
-                if isinstance(value, Value):
-                    self._known["variables", name] = values.of(value).number
-                    continue
-                for place, one in enumerate(value):
-                    self._known["variables", name, place] = values.of(one).number
-        is_active, before = self._told("active"), _Translation(self._env, self._graph, True)
-        stores: list[Store] = []
-        for key in self._known:
-            _, name, *places = key
-            place = places[0] if places else 0
-            kept = where(is_active, self._known[key], before.quantity("variables", name, place))
-            self._known[key] = kept
-            stores.append(Store(kept.node, ("variable", name, place)))
-        return stores, tuple(written)
+        """Write variables."""
+        self._known |= written_variables(self._env, self._graph, self._formulas.updates)
+        stores = [
+            Store(value.node, ("variable", name, *(places or [0])))
+            for (_, name, *places), value in self._known.items()
+        ]
+        return stores, tuple(dict.fromkeys(name for _, name, *_ in self._known))
 
     def _seen(self) -> list[_Seen]:
         """The info if there is one, and the observation unless the pool makes it."""
@@ -223,21 +260,12 @@ class _Judgement:
         parts = [*_named(("info",), self._formulas.info, values)] if env.inside.has_info else []
         if env.inside.pool_observes and not parts:
             return []
-        space: Any = env.observation_space
-        given = self._formulas.observation
-        if not isinstance(space, spaces.Box | spaces.MultiBinary):
-            raise UntraceableError(f"programs make no observations of {space}")
-        if given is None:
-            elements = [
-                values.quantity("outputs", place) for place in range(env.inside.output_count)
-            ]
-        else:
-            elements = [values.of(one) for one in given]
-        array = SeenArray(("observation",), (len(elements),), np.dtype(space.dtype))
-        return [(array, [one.cast(array.dtype) for one in elements]), *parts]
+        elements = values.observation(self._formulas)
+        dtype = np.dtype(env.observation_space.dtype)
+        return [(SeenArray(("observation",), (len(elements),), dtype), elements), *parts]
 
 
-def _named(path: tuple[str, ...], part: Computed, values: _Translation) -> Iterator[_Seen]:
+def _named(path: tuple[str, ...], part: Computed, values: Translation) -> Iterator[_Seen]:
     """The values of an info, each with the names that lead to it."""
     if isinstance(part, Mapping):
         for name, one in part.items():

@@ -62,9 +62,9 @@ class TaskPrograms:
             variables: The names of the episode variables, which are float64 at first.
         """
         graph, flag = Graph(), np.dtype(np.bool_)
-        stopped = graph.load("stopped", None, flag, None)
+        stopped = graph.load("stopped", None, flag)
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
-        judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
+        judgement = compile_graph(graph, [], [stopped, *others], 0)
         types = dict.fromkeys(variables, np.dtype(np.float64))
         return cls(compile_graph(Graph(), [], [], 0), judgement, (), types, (), is_compiled=False)
 
