@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable
 from contextlib import ExitStack
+from typing import Any
 
 import cart_poles
 import gymnasium as gym
@@ -12,9 +14,14 @@ import single
 import tasks
 import training
 import vector
-from calling import ARRAYS, in_python
+from calling import ARRAYS, EACH, in_way
+from gate_rows import CartPoleOnArrays
+from gymnasium.envs.registration import EnvSpec
 from measure import Effort, Run, Sample, by_turns, make_runs
 from tables import Table
+from user_tasks import Tracking
+
+from fmugym.envs import CartPoleEnv
 
 __all__ = ["DOCUMENTS"]
 
@@ -25,15 +32,7 @@ LEFT_OUT = {
 }
 """Rows of the section ``vector`` for which the README has no room."""
 
-TASKS = {
-    "`CartPole-v0`": "CartPole-v0",
-    "`Pendulum-v0`": "Pendulum-v0",
-    "`CloudPendulum-v0`": "CloudPendulum-v0",
-    "a [tracking task](hooks.md#remember-something-during-an-episode)": "tracking",
-}
-WAYS = (None, ARRAYS)
 SIZES = (1, 8, 64, 1024)
-PER_ENV_SIZES = (64, 512, 1024)
 
 
 def _readme(effort: Effort) -> list[Table]:
@@ -46,37 +45,34 @@ def _readme(effort: Effort) -> list[Table]:
 def _vector(effort: Effort) -> list[Table]:
     """The table of docs/vector.md."""
     sizes = SIZES[:2] if effort.quick else SIZES
-    title = "Processor time of a call of step on one thread in us, expressions / hooks on arrays"
-    return [_of_tasks(title, "environments", sizes, _two_ways, effort)]
+    title = "Processor time of a call of step on one thread in us"
+    table = Table(title, ["environments", *map(str, sizes)])
+    logging.getLogger("fmugym.vector").setLevel(logging.ERROR)  # it warns of hooks one by one
+    cells = [_times_of_ways(size, effort) for size in sizes]
+    table.rows = [[name, *(cell[name] for cell in cells)] for name in cells[0]]
+    return [table]
 
 
-def _of_tasks(
-    title: str,
-    corner: str,
-    sizes: Sequence[int],
-    cell: Callable[[tasks.Task, int, Effort], str],
-    effort: Effort,
-) -> Table:
-    """A table with a row for each task and a column for each size."""
-    table = Table(title, [corner, *map(str, sizes)])
-    known = {task.name: task for task in tasks.TASKS}
-    for shown, name in TASKS.items():
-        table.rows.append([shown, *(cell(known[name], size, effort) for size in sizes)])
-    return table
-
-
-def _two_ways(task: tasks.Task, size: int, effort: Effort) -> str:
+def _times_of_ways(size: int, effort: Effort) -> dict[str, str]:
+    """Of a call of ``step``, by the way in which hooks are called."""
+    ways: dict[str, tuple[Callable[[], Any], str | None]] = {
+        "a cart-pole of expressions": (CartPoleEnv, None),
+        "the same, hooks on arrays": (CartPoleOnArrays, ARRAYS),
+        "the same, hooks one by one": (CartPoleOnArrays, EACH),
+        "a [tracking task](hooks.md#remember-something-during-an-episode), hooks on arrays": (
+            Tracking,
+            ARRAYS,
+        ),
+    }
     with ExitStack() as stack:
-        ways = WAYS if _has_expressions(task) else WAYS[1:]
-        runs = {way: tasks.fmugym_run(stack, task, size, way) for way in ways}
-        samples = by_turns(runs, effort)
-    return " / ".join(f"{_fastest(samples[way]) * 1e6:.0f}" for way in ways)
-
-
-def _has_expressions(task: tasks.Task) -> bool:
-    env = task.make()
-    env.close()
-    return env.inside.formulas is not None
+        samples = by_turns(
+            {
+                name: tasks.fmugym_run(stack, in_way(way, make), size)
+                for name, (make, way) in ways.items()
+            },
+            effort,
+        )
+    return {name: f"{_fastest(own) * 1e6:.0f}" for name, own in samples.items()}
 
 
 def _fastest(samples: list[Sample]) -> float:
@@ -85,48 +81,27 @@ def _fastest(samples: list[Sample]) -> float:
 
 
 def _hooks(effort: Effort) -> list[Table]:
-    """A table of docs/vector.md, and what hooks cost that are called one by one."""
-    table = Table(
-        "Processor time of a step of gymnasium.make in us, resets included",
-        ["", "expressions", "in Python", "Gymnasium's own"],
-    )
-    for name, theirs in (("CartPole-v0", "CartPole-v1"), ("Pendulum-v0", "Pendulum-v1")):
-        with ExitStack() as stack:
-            runs, _ = make_runs(_single_makers(stack, f"fmugym/{name}", theirs))
-            samples = by_turns(runs, effort)
-        table.rows.append(
-            [f"`{name}`", *(f"{_fastest(own) * 1e6:.1f}" for own in samples.values())]
-        )
-    return [table, _per_env(effort)]
-
-
-def _per_env(effort: Effort) -> Table:
-    """What hooks cost that are called one environment at a time."""
-    sizes = PER_ENV_SIZES[:1] if effort.quick else PER_ENV_SIZES
-    title = "Processor time of a step per environment in us, all / hooks and FMUs alone"
-    return _of_tasks(title, "one by one", sizes, _all_and_hooks, effort)
-
-
-def _all_and_hooks(task: tasks.Task, size: int, effort: Effort) -> str:
+    """Another table of docs/vector.md."""
+    title = "Processor time of a step of gymnasium.make in us, resets included"
     with ExitStack() as stack:
-        runs = tasks.per_env_runs(stack, task, size)
+        runs, _ = make_runs(_single_makers(stack))
         samples = by_turns(runs, effort)
-    return " / ".join(f"{_fastest(own) * 1e6 / size:.1f}" for own in samples.values())
+    row = ["a cart-pole", *(f"{_fastest(own) * 1e6:.1f}" for own in samples.values())]
+    return [Table(title, ["", *samples], [row])]
 
 
-def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callable[[], Run]]:
-    def make(env_id: str, is_python: bool = False) -> Run:
+def _single_makers(stack: ExitStack) -> dict[str, Callable[[], Run]]:
+    def make(env_id: Any) -> Run:
         env = gym.make(env_id, disable_env_checker=True)
-        if is_python:
-            in_python(env.unwrapped)
         stack.callback(env.close)
         env.action_space.seed(0)
         return cart_poles.environment_run(env, [env.action_space.sample() for _ in range(512)])
 
+    spec = EnvSpec("benchmarks/CartPole-v0", CartPoleOnArrays, max_episode_steps=500)
     return {
-        "expressions": lambda: make(ours),
-        "python": lambda: make(ours, is_python=True),
-        "Gymnasium": lambda: make(theirs),
+        "expressions": lambda: make("fmugym/CartPole-v0"),
+        "hooks in Python": lambda: make(spec),
+        "Gymnasium's own": lambda: make("CartPole-v1"),
     }
 
 

@@ -9,7 +9,6 @@ is. So the cells can show how many times faster a task is than by hand without t
 
 from __future__ import annotations
 
-import logging
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ import gymnasium as gym
 import numpy as np
 import user_tasks
 from c_fmus import build_building
-from calling import ARRAYS, EACH, in_way
+from calling import ARRAYS, in_way
 from cart_poles import require_native_pool
 from measure import Effort, MissingError, Run, by_turns, make_runs, repeated
 from tables import Table, duration, times
@@ -33,7 +32,7 @@ import fmugym
 from fmugym.expressions.program import OPERATIONS, is_function
 from fmugym.task.interface import resolve
 
-__all__ = ["TASKS", "Task", "fmugym_run", "per_env_runs", "tables"]
+__all__ = ["TASKS", "Task", "fmugym_run", "tables"]
 
 SIZES = (1, 8, 64, 1024, 4096)
 TITLE = (
@@ -182,9 +181,10 @@ def _fmugym(stack: ExitStack, task: Task, size: int, way: str | None = None) -> 
     return envs
 
 
-def fmugym_run(stack: ExitStack, task: Task, size: int, way: str | None) -> Run:
+def fmugym_run(stack: ExitStack, make: Callable[[], fmugym.FMUEnv], size: int) -> Run:
     """Count calls of ``step`` of a vector environment of this package on one thread."""
-    envs = _fmugym(stack, task, size, way)
+    envs = fmugym.FMUVectorEnv(make, size, max_episode_steps=500, threads=1)
+    stack.callback(envs.close)
     actions = _actions(envs)
     envs.reset(seed=0)
 
@@ -193,44 +193,6 @@ def fmugym_run(stack: ExitStack, task: Task, size: int, way: str | None) -> Run:
             envs.step(action)
 
     return repeated(block, len(actions))
-
-
-def per_env_runs(stack: ExitStack, task: Task, size: int) -> dict[str, Run]:
-    """Count calls of ``step`` with hooks one by one, and calls of the hooks and FMUs alone."""
-    logging.getLogger("fmugym.vector").setLevel(logging.ERROR)  # it warns of that, rightly
-    envs = _fmugym(stack, task, size, EACH)
-    actions = _actions(envs)
-    envs.reset(seed=0)
-    engine = envs.inside.engine
-
-    def steps() -> None:
-        for action in actions:
-            envs.step(action)
-
-    def hooks() -> None:
-        for env in engine._envs:
-            env._get_inputs()
-        envs.inside.pool.step(None, None, envs.inside.pool.observations)
-        for env in engine._envs:
-            _call_hooks(env)
-
-    return {"steps": repeated(steps, len(actions)), "hooks": repeated(hooks, 1)}
-
-
-def _call_hooks(env: Any) -> None:
-    """Call the hooks of a step that follow the FMU's."""
-    own = env.inside.own
-    if own.update:
-        env._update()
-    env._is_done()
-    if own.is_truncated:
-        env._is_truncated()
-    if env.inside.pool_observes:
-        env._reward_policy()
-    else:
-        env._reward_and_observation()
-    if own.get_info:
-        env._get_info()
 
 
 def _by_hand(stack: ExitStack, task: Task, size: int) -> by_hand.ByHand:

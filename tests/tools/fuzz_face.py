@@ -19,6 +19,7 @@ import odd_values
 from fmu_tools import PlainEnv
 from fuzz_driver import Case, describe, main
 from odd_values import hostile
+from ways import in_way
 
 import fmugym
 from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform, testing
@@ -245,7 +246,7 @@ class Stage:
     def vector(self, hooks, cls=Tracking, mode="next_step"):
         key = cls, hooks, mode
         if key not in self._envs:
-            self._envs[key] = FMUVectorEnv(cls, 3, hooks=hooks, autoreset_mode=mode)
+            self._envs[key] = FMUVectorEnv(in_way(hooks, cls), 3, autoreset_mode=mode)
         return self._envs[key]
 
     def forget(self, env):
@@ -328,7 +329,7 @@ def of_distribution(rng):
 
 
 VECTOR_ARGUMENTS = (
-    *("num_envs", "max_episode_steps", "autoreset_mode", "hooks", "backend", "threads"),
+    *("num_envs", "max_episode_steps", "autoreset_mode", "backend", "threads"),
     *("private_libraries", "isolation", "workers", "call_timeout", "thread"),
 )
 
@@ -362,7 +363,7 @@ def as_vector_argument(rng):
     return (describe(make), arguments), call
 
 
-HOOKS = ("auto", "array", "per_env")
+HOOKS = (None, "arrays", "one by one")
 
 
 def of_vector(rng, stage):

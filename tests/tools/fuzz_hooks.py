@@ -17,10 +17,11 @@ import numpy as np
 from fuzz_driver import Case, main, require
 from odd_values import odd
 from vector_tools import Drawing
+from ways import in_way
 
 from fmugym import FMUGymError, FMUVectorEnv, Normal
 
-WAYS = ("single", "compiled", "array", "per_env", "auto")
+WAYS = ("single", "arrays", "one by one")
 NUM_ENVS = 3
 STEPS = 4
 
@@ -94,7 +95,7 @@ class Swing(Drawing):
 
 
 class Pushed(Swing):
-    """The same with two actions, which can be compiled."""
+    """The same with two actions."""
 
     def _get_action_space(self):
         return gymnasium.spaces.Discrete(2)
@@ -165,7 +166,7 @@ def play(way, cls):
         with contextlib.closing(cls()) as env:
             play_single(env)
         return
-    with contextlib.closing(FMUVectorEnv(cls, NUM_ENVS, hooks=way)) as envs:
+    with contextlib.closing(FMUVectorEnv(in_way(way, cls), NUM_ENVS)) as envs:
         play_many(envs)
 
 

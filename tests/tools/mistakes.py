@@ -411,7 +411,7 @@ class Small(fmugym.FMUEnv):
         return False
 
 
-_ARGUMENTS = ("log_level", "render_mode", "backend", "isolation", "hooks")
+_ARGUMENTS = ("log_level", "render_mode", "backend", "isolation")
 _OPTIONS = {*_ARGUMENTS, *map(misspelt, _ARGUMENTS)}
 
 
@@ -442,7 +442,7 @@ def of_config() -> Iterator[Mistake]:
         yield made(shown(1j), name, WANTED, **{field.name: 1j})
     for name in _ARGUMENTS:
         yield made(f"'{misspelt(name)}'", f"'{name}'", **{misspelt(name): None})
-    for name in ("isolation", "hooks", "backend"):
+    for name in ("isolation", "backend"):
         yield made(shown("wrong"), **{name: "wrong"})
     own = list(inspect.signature(fmugym.FMUVectorEnv.__init__).parameters.values())[2:]
     for name in (one.name for one in own if one.kind is one.KEYWORD_ONLY):
@@ -471,7 +471,9 @@ def of_calls() -> Iterator[Mistake]:
     yield python("load()", lambda: fmugym.load(), "config")
     yield python("load(3)", lambda: fmugym.load(3), "3")
     yield python("scenario", lambda: fmugym.load("task.toml", scenario="x"), "'x'")
-    yield python("argument", lambda: fmugym.load("task.toml", hoks="auto"), "'hoks'", "'hooks'")
+    yield python(
+        "argument", lambda: fmugym.load("task.toml", bakend="auto"), "'bakend'", "'backend'"
+    )
     yield python("Uniform", lambda: fmugym.Uniform(lo=0, high=1), "'lo'", "'low'")
 
 

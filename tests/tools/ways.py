@@ -1,10 +1,14 @@
 """Ways of calling hooks that a class does not choose itself: to compare them with each other."""
 
 import functools
+import sys
+from pathlib import Path
 
 import gymnasium
-from calling import ARRAYS, EACH, EXPRESSIONS, in_python, in_way
 from gymnasium.envs.registration import load_env_creator
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))  # for programs in this folder
+from calling import ARRAYS, EACH, EXPRESSIONS, in_python, in_way
 
 from fmugym.vector import FMUVectorEnv, vectorized
 
