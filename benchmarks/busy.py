@@ -23,6 +23,8 @@ class BusyEnv(fmugym.FMI2CSEnv):
         rare_time: This time in us.
     """
 
+    vectorized = True
+
     def __init__(
         self, path: Path, mean: float, sigma: float = 0.0, rare: float = 0.0, rare_time: float = 0.0
     ) -> None:

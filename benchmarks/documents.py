@@ -12,6 +12,7 @@ import single
 import tasks
 import training
 import vector
+from calling import ARRAYS, in_python
 from measure import Effort, Run, Sample, by_turns, make_runs
 from tables import Table
 
@@ -30,7 +31,7 @@ TASKS = {
     "`CloudPendulum-v0`": "CloudPendulum-v0",
     "a [tracking task](hooks.md#remember-something-during-an-episode)": "tracking",
 }
-WAYS = ("auto", "array")
+WAYS = (None, ARRAYS)
 SIZES = (1, 8, 64, 1024)
 PER_ENV_SIZES = (64, 512, 1024)
 
@@ -45,7 +46,7 @@ def _readme(effort: Effort) -> list[Table]:
 def _vector(effort: Effort) -> list[Table]:
     """The table of docs/vector.md."""
     sizes = SIZES[:2] if effort.quick else SIZES
-    title = "Processor time of a call of step on one thread in us, compiled / on arrays"
+    title = "Processor time of a call of step on one thread in us, expressions / hooks on arrays"
     return [_of_tasks(title, "environments", sizes, _two_ways, effort)]
 
 
@@ -66,9 +67,16 @@ def _of_tasks(
 
 def _two_ways(task: tasks.Task, size: int, effort: Effort) -> str:
     with ExitStack() as stack:
-        runs = {way: tasks.fmugym_run(stack, task, size, way) for way in WAYS}
+        ways = WAYS if _has_expressions(task) else WAYS[1:]
+        runs = {way: tasks.fmugym_run(stack, task, size, way) for way in ways}
         samples = by_turns(runs, effort)
-    return " / ".join(f"{_fastest(samples[way]) * 1e6:.0f}" for way in WAYS)
+    return " / ".join(f"{_fastest(samples[way]) * 1e6:.0f}" for way in ways)
+
+
+def _has_expressions(task: tasks.Task) -> bool:
+    env = task.make()
+    env.close()
+    return env.inside.formulas is not None
 
 
 def _fastest(samples: list[Sample]) -> float:
@@ -80,7 +88,7 @@ def _hooks(effort: Effort) -> list[Table]:
     """A table of docs/vector.md, and what hooks cost that are called one by one."""
     table = Table(
         "Processor time of a step of gymnasium.make in us, resets included",
-        ["", "compiled", "in Python", "Gymnasium's own"],
+        ["", "expressions", "in Python", "Gymnasium's own"],
     )
     for name, theirs in (("CartPole-v0", "CartPole-v1"), ("Pendulum-v0", "Pendulum-v1")):
         with ExitStack() as stack:
@@ -96,7 +104,7 @@ def _per_env(effort: Effort) -> Table:
     """What hooks cost that are called one environment at a time."""
     sizes = PER_ENV_SIZES[:1] if effort.quick else PER_ENV_SIZES
     title = "Processor time of a step per environment in us, all / hooks and FMUs alone"
-    return _of_tasks(title, 'hooks="per_env"', sizes, _all_and_hooks, effort)
+    return _of_tasks(title, "one by one", sizes, _all_and_hooks, effort)
 
 
 def _all_and_hooks(task: tasks.Task, size: int, effort: Effort) -> str:
@@ -107,15 +115,17 @@ def _all_and_hooks(task: tasks.Task, size: int, effort: Effort) -> str:
 
 
 def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callable[[], Run]]:
-    def make(env_id: str, **options: str) -> Run:
-        env = gym.make(env_id, **options)
+    def make(env_id: str, is_python: bool = False) -> Run:
+        env = gym.make(env_id, disable_env_checker=True)
+        if is_python:
+            in_python(env.unwrapped)
         stack.callback(env.close)
         env.action_space.seed(0)
         return cart_poles.environment_run(env, [env.action_space.sample() for _ in range(512)])
 
     return {
-        "compiled": lambda: make(ours, hooks="compiled"),
-        "python": lambda: make(ours, hooks="python"),
+        "expressions": lambda: make(ours),
+        "python": lambda: make(ours, is_python=True),
         "Gymnasium": lambda: make(theirs),
     }
 

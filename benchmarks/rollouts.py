@@ -9,6 +9,7 @@ from typing import Any
 
 import c_limit
 import numpy as np
+from calling import ARRAYS, in_way
 from gymnasium import spaces
 from measure import Effort, Run, Sample, by_turns, cpu_rate, make_runs, ratio, repeated, wall_rate
 from tables import Table, duration, rate, times
@@ -62,21 +63,21 @@ def _add(table: Table, name: str, own: list[Sample], figure: str, share: str) ->
 
 def _rollouts(stack: ExitStack) -> dict[str, Callable[[], Run]]:
     return {
-        "compiled hooks, from one snapshot": lambda: _rollout(stack, "compiled"),
-        "hooks on arrays, from one snapshot": lambda: _rollout(stack, "array"),
+        "expressions, from one snapshot": lambda: _rollout(stack, None),
+        "hooks on arrays, from one snapshot": lambda: _rollout(stack, ARRAYS),
         LIMIT: _limit,
     }
 
 
-def _make(stack: ExitStack, hooks: str) -> fmugym.FMUVectorEnv:
-    envs = fmugym.FMUVectorEnv(EndlessCartPole, CANDIDATES, hooks=hooks, threads=THREADS)
+def _make(stack: ExitStack, way: str | None) -> fmugym.FMUVectorEnv:
+    envs = fmugym.FMUVectorEnv(in_way(way, EndlessCartPole), CANDIDATES, threads=THREADS)
     stack.callback(envs.close)
     return envs
 
 
-def _rollout(stack: ExitStack, hooks: str) -> Run:
+def _rollout(stack: ExitStack, way: str | None) -> Run:
     envs, actions = (
-        _make(stack, hooks),
+        _make(stack, way),
         np.random.default_rng(0).integers(0, 2, (CANDIDATES, HORIZON)),
     )
     with EndlessCartPole() as env:
@@ -99,7 +100,7 @@ def _limit() -> Run:
 
 
 def _snapshots(stack: ExitStack) -> dict[str, Run]:
-    envs = _make(stack, "compiled")
+    envs = _make(stack, None)
     envs.reset(seed=0)
     snapshot = envs.save_state()
     return {

@@ -1,4 +1,4 @@
-"""Measure typical tasks: compiled, on arrays, written by hand in numpy, and in Gymnasium's vectors.
+"""Measure typical tasks: as they are, on arrays, by hand in numpy, and in Gymnasium's vectors.
 
 All run on one thread. A way plays the same steps again and again, in turns with the others. Their
 time is the sum of the least times that each 16 calls of ``step`` have taken, because other work on
@@ -9,6 +9,7 @@ is. So the cells can show how many times faster a task is than by hand without t
 
 from __future__ import annotations
 
+import logging
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ import gymnasium as gym
 import numpy as np
 import user_tasks
 from c_fmus import build_building
+from calling import ARRAYS, EACH, in_way
 from cart_poles import require_native_pool
 from measure import Effort, MissingError, Run, by_turns, make_runs, repeated
 from tables import Table, duration, times
@@ -129,9 +131,10 @@ def _add(table: Table, task: Task, sizes: tuple[int, ...], effort: Effort) -> No
 def _allowed_each(task: Task) -> float:
     """The time in s that an environment may take beyond its FMU, according to its programs."""
     with ExitStack() as stack:
-        programs = _fmugym(stack, task, 1, "auto").inside.engine._task
-    if programs is None:
+        engine = _fmugym(stack, task, 1).inside.engine
+    if not engine.has_expressions_only:
         return float("nan")
+    programs = engine._task
     codes = np.concatenate([programs.inputs.code[:, 0], programs.judgement.code[:, 0]])
     names = [OPERATIONS[code] for code in codes.tolist()]
     return 1e-9 * (10.0 + sum(map(_allowed, names)))
@@ -164,24 +167,24 @@ def _makers(
     stack: ExitStack, task: Task, size: int, steps: int
 ) -> Iterator[tuple[str, Callable[[], Callable[[float], Blocks]]]]:
     yield FMU, lambda: _fmu_run(stack, task, size, steps)
-    for name, hooks in (("fmugym", "auto"), ('hooks="array"', "array")):
-        yield name, lambda hooks=hooks: _blocks(_fmugym(stack, task, size, hooks), steps)
+    yield "fmugym", lambda: _blocks(_fmugym(stack, task, size), steps)
+    yield "hooks on arrays", lambda: _blocks(_fmugym(stack, task, size, ARRAYS), steps)
     yield BY_HAND, lambda: _blocks(_by_hand(stack, task, size), steps)
     for name in MOST:
         yield name, lambda name=name: _blocks(_gymnasium(stack, task, size, name), steps)
 
 
-def _fmugym(stack: ExitStack, task: Task, size: int, hooks: str) -> Any:
+def _fmugym(stack: ExitStack, task: Task, size: int, way: str | None = None) -> Any:
     envs = fmugym.FMUVectorEnv(
-        task.make, size, max_episode_steps=task.limit, hooks=hooks, threads=1
+        in_way(way, task.make), size, max_episode_steps=task.limit, threads=1
     )
     stack.callback(envs.close)
     return envs
 
 
-def fmugym_run(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
+def fmugym_run(stack: ExitStack, task: Task, size: int, way: str | None) -> Run:
     """Count calls of ``step`` of a vector environment of this package on one thread."""
-    envs = _fmugym(stack, task, size, hooks)
+    envs = _fmugym(stack, task, size, way)
     actions = _actions(envs)
     envs.reset(seed=0)
 
@@ -193,8 +196,9 @@ def fmugym_run(stack: ExitStack, task: Task, size: int, hooks: str) -> Run:
 
 
 def per_env_runs(stack: ExitStack, task: Task, size: int) -> dict[str, Run]:
-    """Count calls of ``step`` with ``hooks="per_env"``, and calls of the hooks and FMUs alone."""
-    envs = _fmugym(stack, task, size, "per_env")
+    """Count calls of ``step`` with hooks one by one, and calls of the hooks and FMUs alone."""
+    logging.getLogger("fmugym.vector").setLevel(logging.ERROR)  # it warns of that, rightly
+    envs = _fmugym(stack, task, size, EACH)
     actions = _actions(envs)
     envs.reset(seed=0)
     engine = envs.inside.engine

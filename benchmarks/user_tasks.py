@@ -20,6 +20,8 @@ _LIMIT = 0.03
 class SwingUp(fmugym.FMI2CSEnv):
     """The README's task: turn a pendulum up to a stop."""
 
+    vectorized = True
+
     def __init__(self) -> None:
         config = {
             "model_input_names": ["tau"],
@@ -38,6 +40,8 @@ class SwingUp(fmugym.FMI2CSEnv):
 
 class Tracking(fmugym.FMI2CSEnv):
     """Follow a target angle, with an integral of the error and a quadratic reward."""
+
+    vectorized = True
 
     def __init__(self) -> None:
         config = {
@@ -79,6 +83,8 @@ class Tracking(fmugym.FMI2CSEnv):
 class Uncompiled(Tracking):
     """``Tracking`` with an observation of which numpy must find the middle value."""
 
+    vectorized = True
+
     def _get_observation(self) -> Any:
         observation = super()._get_observation()
         return np.concatenate([observation[:4], np.partition(observation, 2, axis=0)[2:3]])
@@ -86,6 +92,8 @@ class Uncompiled(Tracking):
 
 class Goal(fmugym.FMI2CSEnv):
     """Reach a goal angle and stay; a goal task in Gymnasium-Robotics' form."""
+
+    vectorized = True
 
     def __init__(self) -> None:
         config = {
@@ -125,6 +133,8 @@ class Building(fmugym.FMI2CSEnv):
     Args:
         path: The FMU of ``building.c``.
     """
+
+    vectorized = True
 
     hours = np.array([0.0, 6.0, 8.0, 18.0, 22.0, 24.0])
     coldest = np.array([17.0, 17.0, 21.0, 21.0, 17.0, 17.0])

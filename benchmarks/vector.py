@@ -10,6 +10,7 @@ import cart_poles
 import gymnasium as gym
 from by_hand import TrackingByHand
 from cart_poles import GYMNASIUM, STEPS
+from gate_rows import CartPoleOnArrays
 from gymnasium.vector.utils import batch_space
 from measure import (
     Effort,
@@ -79,8 +80,7 @@ def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run
     for mode in ("SAME_STEP", "DISABLED"):
         options = {"autoreset_mode": mode.lower(), "threads": most}
         yield f"fmugym, {mode}, {text}", lambda o=options: _fmugym(stack, size, **o)
-    arrays = {"hooks": "array", "threads": most}
-    yield f'fmugym, hooks="array", {text}', lambda: _fmugym(stack, size, **arrays)
+    yield f"fmugym, hooks on arrays, {text}", lambda: _on_arrays(stack, size, most)
     yield BASE, lambda: _gymnasium(stack, size, "vector_entry_point")
     yield "Gymnasium SyncVectorEnv", lambda: _gymnasium(stack, size, "sync")
     yield "Gymnasium AsyncVectorEnv", lambda: _gymnasium(stack, size, "async", context="spawn")
@@ -109,6 +109,13 @@ def _tracking(stack: ExitStack, size: int, by_hand: bool) -> Run:
 
 def _fmugym(stack: ExitStack, size: int, **options: Any) -> Run:
     env = cart_poles.fmugym_vector(size, **options)
+    stack.callback(env.close)
+    return cart_poles.vector_run(env)
+
+
+def _on_arrays(stack: ExitStack, size: int, threads: int) -> Run:
+    cart_poles.require_native_pool()
+    env = fmugym.FMUVectorEnv(CartPoleOnArrays, size, threads=threads)
     stack.callback(env.close)
     return cart_poles.vector_run(env)
 

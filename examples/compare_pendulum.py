@@ -64,7 +64,7 @@ def policy(weights: Array, observations: Array) -> Array:
 def train(generations: int, seed: int = 0) -> tuple[Array, list[float]]:
     """Returns the weights, and the mean return of each generation."""
     rng, returns = np.random.default_rng(seed), []
-    envs = fmugym.FMUVectorEnv(SwingUp, TRIED * len(LESSONS), hooks="compiled")
+    envs = fmugym.FMUVectorEnv(SwingUp, TRIED * len(LESSONS))
     mean, spread = np.zeros(6), np.full(6, 3.0)
     for _ in range(generations):
         start(envs, np.tile(LESSONS + rng.uniform(-10, 10, len(LESSONS)), TRIED))

@@ -37,6 +37,8 @@ UNITS = {"l": "m", "b": "N m s/rad", "c": "N m"}
 class Cell(fmugym.FMUEnv):
     """The cell, swinging freely."""
 
+    vectorized = True
+
     def __init__(self, angle: float) -> None:
         config = {
             "model_input_names": "tau",

@@ -83,7 +83,7 @@ def forward(envs: Any, here: Any, plan: Plan, changes: Array, gains: Array) -> t
 
 def optimize(iterations: int = 80, seed: int = 0) -> Plan:
     """Improve small random torques until the cost no longer falls."""
-    envs = fmugym.FMUVectorEnv(SwingUp, len(LENGTHS), hooks="compiled")
+    envs = fmugym.FMUVectorEnv(SwingUp, len(LENGTHS))
     envs.reset(seed=0)
     here = envs.save_state(0)
     torques = np.random.default_rng(seed).normal(0, 0.1, (HORIZON, 1))

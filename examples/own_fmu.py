@@ -23,6 +23,8 @@ FMU_PATH = fmugym.bundled_fmu("Pendulum")  # a relative path is relative to this
 class BrakeEnv(FMI2CSEnv):
     """Bring a swinging pendulum to rest; q is its angle from hanging down."""
 
+    vectorized = True
+
     def __init__(self, largest_torque: float = 0.01, log_level: int = logging.WARNING) -> None:
         config = {
             "model_input_names": "tau",

@@ -117,6 +117,8 @@ def price(hour):
 class HomeEnv(fmugym.FMUEnv):
     """A day in March. The reward is the cost in euro, negative, as is a euro for a kelvin hour."""
 
+    vectorized = True
+
     def __init__(self, system, **options):
         config = {
             "model_input_names": ["heating", "charging"],
