@@ -13,7 +13,10 @@ from pathlib import Path
 import fmpy
 
 HERE = Path(__file__).parents[1]
-FOLDERS = sorted({str(HERE), *(str(path.parent) for path in HERE.rglob("test_*.py"))})
+_BENCHMARKS = HERE.parent / "benchmarks"
+FOLDERS = sorted(
+    {str(HERE), str(_BENCHMARKS), *(str(path.parent) for path in HERE.rglob("test_*.py"))}
+)
 """Where tests are: they import helpers and each other by the names of their modules."""
 
 PATH = os.pathsep.join(FOLDERS)
