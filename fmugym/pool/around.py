@@ -1,4 +1,4 @@
-"""Compiled hooks around the steps of pools that have no programs of their own.
+"""Programs around the steps of pools that have no programs of their own.
 
 The programs run in this process, on the arrays of such a pool, which may be memory that it shares
 with others. A native pool runs them that has no FMU of its own.

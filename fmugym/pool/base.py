@@ -34,11 +34,11 @@ MaskArray = npt.NDArray[np.bool_]
 
 
 Played = tuple[Any, int, bool, MaskArray | None]
-"""What a step with compiled hooks returns; see ``Play.step``."""
+"""What a step with programs returns; see ``Play.step``."""
 
 
 class Play(NamedTuple):
-    """What a pool does that is prepared for a step with compiled hooks.
+    """What a pool does that is prepared for a step with programs.
 
     ``before`` and ``after`` surround a step of the FMUs by the caller, who also starts episodes. A
     pool that steps and starts the FMUs itself has the other functions, too.
@@ -239,12 +239,12 @@ class Pool(ABC):
 
     @property
     def plays_alone(self) -> bool:
-        """Whether the pool steps and starts the FMUs itself in a step with compiled hooks."""
+        """Whether the pool steps and starts the FMUs itself in a step with programs."""
         return False
 
     @property
     def rolls_out(self) -> bool:
-        """Whether ``roll_out`` does many steps of compiled hooks in one call."""
+        """Whether ``roll_out`` does many steps with programs in one call."""
         return self.plays_alone
 
     def extract(self) -> bool:
@@ -256,7 +256,7 @@ class Pool(ABC):
         return False
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
-        """Prepare steps with compiled hooks.
+        """Prepare steps with programs.
 
         Args:
             variables: As for ``reset``.
@@ -268,7 +268,7 @@ class Pool(ABC):
         Raises:
             SimulationError: If the pool does not support it.
         """
-        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+        raise SimulationError(f"a {type(self).__name__} cannot run programs")
 
     def roll_out(self, *arrays: Any) -> int:
         """Do many steps of the prepared play in one call; see ``NativePool``.
@@ -276,7 +276,7 @@ class Pool(ABC):
         Raises:
             SimulationError: If the pool does not support it; see ``rolls_out``.
         """
-        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
+        raise SimulationError(f"a {type(self).__name__} cannot run programs")
 
     def halt(self) -> None:
         """Stop at once whatever runs on without being stepped; the next reset starts it again."""

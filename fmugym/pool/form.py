@@ -295,7 +295,7 @@ def form_of_pool(
 
 
 def form_of_programs(spec: PoolSpec, count: int, threads: int) -> bytes:
-    """The form of a pool whose instances are elsewhere: it runs compiled hooks only.
+    """The form of a pool whose instances are elsewhere: it runs programs only.
 
     Args:
         spec: As for ``form_of_pool``.
@@ -497,7 +497,7 @@ def _write_loop(writer: Writer, loop: Loop | None, label: str) -> None:
         writer.text(label.encode())
 
 
-# Compiled hooks
+# Programs
 
 
 def form_of_program(

@@ -298,7 +298,7 @@ class NativePool(AskingPool):
 
         return call
 
-    # Steps with compiled hooks.
+    # Steps with programs around them.
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""

@@ -1,4 +1,4 @@
-/* Rollouts: many steps of the instances in one request, compiled hooks included.
+/* Rollouts: many steps of the instances in one request, programs included.
  *
  * The rows that programs read and write are memory of the other process. So the worker has rows of its
  * own, and their values come with each request. First are the rows of the inputs, of the outputs and

@@ -261,7 +261,7 @@ class ProcessPool(AskingPool):
         self._group.note_lost()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
-    # Compiled hooks
+    # Programs
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""

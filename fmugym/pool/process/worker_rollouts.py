@@ -1,4 +1,4 @@
-"""Rollouts of worker processes: each does all steps of its block, compiled hooks included.
+"""Rollouts of worker processes: each does all steps of its block, programs included.
 
 The rows that programs read and write are memory of this process. So a worker gets numbers in the
 place of rows, and has rows of its own. Their values come with each rollout. ``native/worker``

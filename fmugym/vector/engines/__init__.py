@@ -1,1 +1,1 @@
-"""Three ways to play N environments: with compiled hooks, on arrays, or one by one."""
+"""Three ways to play N environments: by programs, with hooks on arrays, or one by one."""
