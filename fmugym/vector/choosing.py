@@ -120,7 +120,8 @@ def hook_of_one(cls: type[FMUEnv]) -> str | None:
     """
     for name in (*ORDER, "_goal_reward"):
         owner = next(one for one in cls.__mro__ if name in vars(one))
-        if owner is not Hooks and not vars(owner).get("vectorized", False):
+        is_default = getattr(cls, name) is getattr(Hooks, name)
+        if not is_default and not vars(owner).get("vectorized", False):
             return name
     return None
 

@@ -335,8 +335,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         engine = self.inside.engine
         started = engine.reset_by({"reset_mask": ended})
         observations, infos = engine.reset(ended, None, {}) if started is None else started
-        infos |= final_infos(last, restricted(result.infos, ended), ended)
-        infos = merged(restricted(result.infos, ~ended), infos)
+        told = result.infos
+        infos |= final_infos(last, restricted(told, ended), ended)
+        if told:
+            infos = merged(restricted(told, ~ended), infos)
         return result._replace(observations=observations, infos=infos)
 
     def render(self) -> tuple[Any, ...] | None:

@@ -36,6 +36,12 @@ class Overriding(Declared):
         return self.state[0]
 
 
+class DefaultAgain(Overriding):
+    """Takes the default back."""
+
+    _reward_policy = fmugym.FMUEnv._reward_policy
+
+
 class SayingItAgain(Declared):
     vectorized = True
 
@@ -69,6 +75,7 @@ WAYS = [
     (Declared, "arrays"),
     (Inheriting, "arrays"),
     (Overriding, "one by one"),
+    (DefaultAgain, "arrays"),
     (SayingItAgain, "arrays"),
     (Goals, "one by one"),
     (lambda: fmugym.load(SWING), "expressions"),

@@ -123,22 +123,9 @@ def own_hooks(env: FMUEnv) -> list[str]:
 
 def _is_own(env: FMUEnv, name: str) -> bool:
     """Whether a hook is neither a default nor an expression."""
-    if name in vars(env):
-        return False
     if name == "_reward_policy" and env.inside.own.goal_reward:
         return True
-    return all(name in vars(cls) for cls in [_owner(type(env), name)]) and not _is_default(
-        env, name
-    )
-
-
-def _is_default(env: FMUEnv, name: str) -> bool:
-    owner = _owner(type(env), name)
-    return owner is Hooks or owner.__module__.startswith("fmugym.declared.")
-
-
-def _owner(cls: type[Any], name: str) -> type[Any]:
-    return next(one for one in cls.__mro__ if name in vars(one))
+    return name not in vars(env) and getattr(type(env), name) is not getattr(Hooks, name)
 
 
 # The states
