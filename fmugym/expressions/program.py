@@ -25,6 +25,7 @@ __all__ = [
     "Program",
     "UncompilableError",
     "evaluate",
+    "is_function",
     "letter_of",
     "operation_of",
 ]
@@ -133,6 +134,11 @@ def operation_of(ufunc: np.ufunc, letter: str) -> str | None:
         return _OF_FLAGS.get(ufunc.__name__)
     name = "power" if ufunc is np.float_power else ufunc.__name__
     return f"{name} {letter}" if f"{name} {letter}" in OPERATIONS else None
+
+
+def is_function(operation: str) -> bool:
+    """Whether an operation is a function of the C library, which takes longer than arithmetic."""
+    return operation.partition(" ")[0] in _FUNCTIONS
 
 
 Row = tuple[Hashable, ...]

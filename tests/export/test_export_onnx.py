@@ -78,8 +78,8 @@ class TestFunctions:
             with np.errstate(all="ignore"):
                 wanted = ufunc(*values)
 
-            def apply(graph, cells, ufunc=ufunc, dtype=wanted.dtype):
-                return graph.apply(ufunc, cells, dtype)
+            def apply(graph, operands, ufunc=ufunc, dtype=wanted.dtype):
+                return graph.compute("ufunc", ufunc, operands, dtype, ufunc)
 
             single = ufunc in {np.arcsin, np.arccos, np.arctan, np.arctan2}
             tolerance = 1e-12 if letter == "d" and not single else 3e-6
@@ -88,8 +88,8 @@ class TestFunctions:
             )
 
     def test_others_are_refused(self):
-        def cube_root(graph, cells):
-            return graph.apply(np.cbrt, cells, np.dtype(np.float64))
+        def cube_root(graph, operands):
+            return graph.compute("ufunc", np.cbrt, operands, np.dtype(np.float64), np.cbrt)
 
         with pytest.raises(ConfigError, match=r"cbrt.*float64"):
             written(cube_root, [np.ones(3)])
@@ -99,9 +99,9 @@ class TestFunctions:
         rng = np.random.default_rng(0)
         xs, ys = np.sort(rng.normal(size=count)), rng.normal(size=count)
 
-        def look_up(graph, cells):
+        def look_up(graph, operands):
             graph.tables["table"] = np.concatenate([xs, ys, [-9.0, 9.0]])
-            return graph.compute("interpolate", "table", cells, np.dtype(np.float64), None)
+            return graph.compute("interpolate", "table", operands, np.dtype(np.float64), None)
 
         seen = np.concatenate([xs, rng.normal(size=50) * 2])
         own = written(look_up, [seen])
@@ -111,10 +111,11 @@ class TestFunctions:
 def written(operation, values):
     """What ONNX Runtime makes of an operation of a graph."""
     nodes, graph, dtype = Nodes(), Graph(), values[0].dtype
-    cells = tuple(graph.load("row", name, dtype, None) for name in "xy"[: len(values)])
-    result = graph.node(cell := operation(graph, cells)).dtype
-    operations = Operations(nodes, graph, {one.node for one in cells}, "xy".__getitem__)
-    (name,) = operations.written([cell.node])
+    operands = tuple(graph.load("row", name, dtype) for name in "xy"[: len(values)])
+    node = operation(graph, operands)
+    result = graph.nodes[node].dtype
+    operations = Operations(nodes, graph, set(operands), "xy".__getitem__)
+    (name,) = operations.written([node])
     made = onnx.helper.make_graph(
         nodes.nodes,
         "function",

@@ -23,6 +23,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from ways import in_way
 
 from fmugym import FMU, FMUGymError
 from fmugym.pool import PoolSpec
@@ -80,9 +81,9 @@ class Machine(RuleBasedStateMachine):
         mode=st.sampled_from(["next_step", "same_step", "disabled"]),
         way=st.sampled_from(["arrays", "one by one"]),
     )
-    def begin(self, retries, substeps, mode, hooks):
+    def begin(self, retries, substeps, mode, way):
         self.options = {"substeps": substeps, "fault_retries": retries if self.version > 1 else 0}
-        self.vector_options = {"autoreset_mode": mode, "hooks": hooks}
+        self.way, self.vector_options = way, {"autoreset_mode": mode}
         self.subject = self.make()
 
     @rule(fault=FAULTS)
@@ -186,7 +187,8 @@ class VectorMachine(Machine):
 
     def make(self):
         options = {"private_libraries": False} | self.vector_options
-        return FMUVectorEnv(lambda: LawfulEnv(self.path, **self.options), N, **options)
+        make = in_way(self.way, lambda: LawfulEnv(self.path, **self.options))
+        return FMUVectorEnv(make, N, **options)
 
     @rule(mask=MASKS, masked=st.booleans())
     def reset(self, mask, masked):

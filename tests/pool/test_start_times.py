@@ -14,6 +14,7 @@ from fmu_tools import grouped
 from pool_tools import KINDS, open_pool, step
 from test_rollouts import WAYS
 from vector_tools import require_same_alone
+from ways import in_way
 
 import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
@@ -149,8 +150,8 @@ ACTION = np.zeros(1, np.float32)
 all_ways = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 
-def vector(make, n=3, **options):
-    return FMUVectorEnv(make, n, **options)
+def vector(make, n=3, way=None, **options):
+    return FMUVectorEnv(in_way(way, make), n, **options)
 
 
 def play(env, seed, steps):

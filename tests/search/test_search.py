@@ -162,13 +162,6 @@ class Sorted(Branching):
         return np.sort(np.array(self.state), axis=0)[1] < -1e9
 
 
-class Stepping(Branching):
-    """A step of its own."""
-
-    def step(self, action):
-        return super().step(action)
-
-
 def load(document=FALLING, **changes):
     task = {key: value for key, value in (document | changes).items() if value is not None}
     return partial(fmugym.load, fmugym.Task.from_dict(task))
@@ -231,14 +224,13 @@ class TestArena:
             assert arena.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
 
     @pytest.mark.parametrize("most_envs", [512, 7])
-    @pytest.mark.parametrize("kind", ["arrays", "one by one", "own_step", "process"])
+    @pytest.mark.parametrize("kind", ["arrays", "one by one", "process"])
     def test_no_episode_is_stepped_beyond_its_end(self, kind, most_envs):
         """The FMUs do as many steps as the episodes in single environments have."""
         make = {
             "compiled": load(),
             "arrays": Sorted,
             "one by one": Branching,
-            "own_step": Stepping,
             "process": partial(fmugym.load, fmugym.Task.from_dict(FALLING), isolation="process"),
         }[kind]
         lengths = []

@@ -223,7 +223,8 @@ def test_a_first_observation_that_is_not_finite(made):
         envs = made(Dividing)
         envs.set_attr("bound", 1.0)
         mask = np.array([False, False, True, False, True])
-        with pytest.raises(SimulationError, match=r"environment 2.*nan") as caught:
+        refused = pytest.raises(SimulationError, match=r"environment 2.*nan")
+        with np.errstate(invalid="ignore"), refused as caught:
             envs.reset(options={"reset_mask": form(mask)})
         texts.append(str(caught.value))
         envs.set_attr("bound", 0.0)
