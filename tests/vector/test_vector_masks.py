@@ -220,7 +220,7 @@ class Dividing(Drawing):
 def test_a_first_observation_that_is_not_finite(made):
     texts = []
     for form in np.array, np.ndarray.tolist:
-        envs = made(Dividing)
+        envs = made(in_way("arrays", Dividing))
         envs.set_attr("bound", 1.0)
         mask = np.array([False, False, True, False, True])
         refused = pytest.raises(SimulationError, match=r"environment 2.*nan")
