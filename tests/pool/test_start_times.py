@@ -14,9 +14,10 @@ from fmu_tools import grouped
 from pool_tools import KINDS, open_pool, step
 from test_rollouts import WAYS
 from vector_tools import require_same_alone
+from ways import many
 
 import fmugym
-from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
+from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, Uniform
 from fmugym.errors import TaskError
 from fmugym.pool.spec import START_TIME
 from fmugym.series import RecordSeries
@@ -150,7 +151,7 @@ all_ways = pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 
 
 def vector(make, n=3, **options):
-    return FMUVectorEnv(make, n, **options)
+    return many(make, n, **options)
 
 
 def play(env, seed, steps):

@@ -19,7 +19,7 @@ from vector_tools import require_same_alone
 from ways import in_way
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
+from fmugym import Choice, ConfigError, Uniform
 from fmugym.series import RecordSeries
 
 WORDS = ("a", "ünter", "longest of all", "")
@@ -283,16 +283,6 @@ def test_a_distribution_that_draws_another_text(feedthrough):
 
     with pytest.raises(ConfigError, match=r"'String_parameter'.*'zzz'.*'x'"):
         Reading(feedthrough[3], words=Wrong()).reset()
-
-
-def test_hooks_that_read_a_string_are_named(feedthrough, caplog):
-    with caplog.at_level("INFO", "fmugym"):
-        envs = FMUVectorEnv(lambda: Telling(feedthrough[3]), 2)
-        envs.reset()
-        envs.step(np.zeros(2, np.int64))
-        envs.close()
-    assert "_reward_policy" in caplog.text
-    assert "String_parameter" in caplog.text
 
 
 NUMBERS = "number or an Enumeration"

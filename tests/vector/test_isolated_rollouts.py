@@ -88,7 +88,7 @@ def test_a_new_worker_gets_the_programs(make):
         require_equal(ours, theirs)
 
 
-def faulty(path, **config):
+def faulty(path):
     """Integrates its action until the FMU does what its parameters say."""
     task = {
         "fmu": str(path),
@@ -97,7 +97,7 @@ def faulty(path, **config):
         "parameters": start_values("none"),
         "agent": {"actions": ["u"], "observations": ["y"]},
         "reward": "y",
-        "config": {"isolation": "process", **config},
+        "config": {"isolation": "process"},
     }
     return fmugym.load(task, log_level="ERROR")
 
@@ -108,7 +108,7 @@ def with_faults(make, path, fault, at, way="expressions", **config):
         name: [start_values(f, at=a)[name] for f, a in zip(fault, at, strict=True)]
         for name in ("fault", "stage", "at")
     }
-    envs = make(lambda: faulty(path, **config), 3, config.pop("workers", 3), way=way)
+    envs = make(lambda: faulty(path), 3, config.pop("workers", 3), way=way, **config)
     for name, values in parameters.items():
         envs.set_attr(name, values)
     envs.reset(seed=0)
