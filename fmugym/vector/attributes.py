@@ -17,7 +17,6 @@ from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.calls import TOGETHER, require_settable
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
-from fmugym.vector.views import take
 
 __all__ = ["Attributes"]
 
@@ -89,7 +88,7 @@ class Attributes:
         Raises:
             ConfigError: If they have another shape, or are no finite numbers.
         """
-        shape = np.shape(take(self._prototype.variables[name], 0))
+        shape = np.shape(self._prototype.config.episode_variables[name])
         try:
             values = np.array([np.broadcast_to(np.asarray(v, np.float64), shape) for v in each])
         except Exception:  # the values are the caller's
@@ -147,7 +146,7 @@ class Attributes:
             drawn = name in env.inside.draws.drawn_names
             if drawn and len(values) < len(self._engine.ended):
                 raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
-            present = [take(env.variables[name], i) for i in range(len(self._engine.ended))]
+            present = [self._engine.read(name, i) for i in range(len(self._engine.ended))]
             each = [values.get(index, one) for index, one in enumerate(present)]
             self._engine.set_variable(name, self._numbers(name, each))
             return
