@@ -88,7 +88,7 @@ class Attributes:
         Raises:
             ConfigError: If they have another shape, or are no finite numbers.
         """
-        shape = np.shape(self._prototype.config.episode_variables[name])
+        shape = np.shape(self._prototype.config.variable_starts[name])
         try:
             values = np.array([np.broadcast_to(np.asarray(v, np.float64), shape) for v in each])
         except Exception:  # the values are the caller's

@@ -375,3 +375,20 @@ class TestNumbersOfBundledTasks:
         name = "force_mag" if "Cart" in id_ else "max_torque"
         with pytest.raises(ConfigError, match=f"env.variables\\['{name}'\\]"):
             setattr(env, name, 1.0)
+
+
+@pytest.mark.parametrize(
+    "cls", [Pendulum, type("InPython", (Pendulum,), {"_is_done": lambda _: False})]
+)
+def test_memory_may_be_set_for_each_environment(make_envs, cls):
+    keys = {"memory": {"sum": {"start": 1, "update": "sum + 1"}}, "reward": "sum"}
+    envs = make_envs(functools.partial(cls, **keys), 3)
+    envs.set_attr("sum", [10.0, 20.0, 30.0])
+    envs.reset(seed=0)
+    for step in range(1, 4):
+        assert envs.step(np.zeros((3, 1), np.float32))[1].tolist() == [
+            start + step for start in (10.0, 20.0, 30.0)
+        ]
+    assert envs.get_attr("sum") == (13.0, 23.0, 33.0)
+    envs.set_attr("sum", 5.0)
+    assert envs.step(np.zeros((3, 1), np.float32))[1].tolist() == [6.0] * 3
