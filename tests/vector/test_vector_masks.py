@@ -212,7 +212,8 @@ class Dividing(Drawing):
         return gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
     def _get_observation(self):
-        return np.array([np.log(self.variables["start"] - self.bound)])
+        with np.errstate(invalid="ignore"):
+            return np.array([np.log(self.variables["start"] - self.bound)])
 
     bound = 0.0
 

@@ -212,8 +212,8 @@ class PerEnvEngine(Engine):
         env = self._envs[index]
         is_first = not env.inside.was_reset
         try:
+            self.has_moved = True  # what can be refused was checked before
             result = env.reset(seed=seed, options=dict(options))
-            self.has_moved = True
             if is_first:  # a reset prepares the hooks
                 _share_constants(self._envs[0], env)
             return result
