@@ -366,7 +366,7 @@ FILES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
     ({"reward": "q ^ 2"}, ("'q ^ 2'", "**", "power")),
     ({"reward": "Q"}, ("'Q'", "'q'")),
     ({"reward": "abs(q, 1)"}, ("abs", "1", "2")),
-    ({"reward": "q.x"}, ("'q.x'", "[variables]")),
+    ({"reward": "q.x"}, ("unknown name 'q.x'", "'q'")),
     ({"reward": "'a'"}, ("'a'", "number")),
     ({"reward": "lambda: 1"}, ("lambda",)),
     ({"reward": {"a": {"weight": 1}}}, ("reward.a", "'expr'")),
