@@ -17,6 +17,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.language import CONSTANTS, Expression, Names
+from fmugym.expressions.mathematics import FUNCTIONS
 from fmugym.expressions.value import Computed, Value, where
 from fmugym.task.interface import Interface
 from fmugym.task.spaces import discrete_values
@@ -27,6 +28,7 @@ _CLOCKS: Final = ("time", "clock", "elapsed", "step", "dt", "dt_h")
 _FLAGS: Final = ("done", "after_end")
 _ACTION: Final = "action"
 _SECONDS_PER_HOUR: Final = 3600.0
+_RESERVED: Final = frozenset({*CONSTANTS, *FUNCTIONS, *_CLOCKS, *_FLAGS, _ACTION, "previous"})
 
 
 def with_monitors(config: EnvConfig, description: ModelDescription) -> EnvConfig:
@@ -79,6 +81,9 @@ class _ClassFormulas:
     def made(self) -> Formulas:
         """The formulas, in which no mistake is left."""
         config = self._config
+        for name in _RESERVED.intersection(config.variable_starts):
+            text = f"the episode variable {name!r} has a name with a meaning of its own"
+            self._mistakes[f"{text} in expressions; rename it"] = None
         formulas = Formulas(
             self._graph,
             self._inputs() if config.inputs else None,

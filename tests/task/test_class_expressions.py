@@ -297,6 +297,8 @@ class TestOverridden:
             "'n' is in",
         ),
         ({"memory": {"x_0": {"start": 0, "update": "1"}}}, "'x_0' is both"),
+        ({"memory": {"pi": {"start": 0, "update": "1"}}}, "'pi' has a name with a meaning"),
+        ({"episode_variables": {"time": 0}}, "'time' has a name with a meaning"),
         ({"costs": {"much": "sqr(x)"}}, "unknown function 'sqr'; did you mean 'sqrt'"),
         ({"observations": ["x", "y"]}, "config key 'observations': unknown name 'y'"),
         ({"info": {"cost": "1"}}, "'cost' has a meaning of its own"),
