@@ -501,7 +501,9 @@ DATA: Final = Table(
             "the task's standard time",
         ),
         "values": Key(
-            VALUES, "Values, instead of a file; in a dict, an array or a column of pandas will do."
+            VALUES,
+            "Values, instead of a file; in a dict, an array of numpy, or a column or a frame of "
+            "pandas. These alone are short for the table.",
         ),
         "times": Key(
             TIMES,

@@ -19,6 +19,7 @@ import numpy as np
 from fmugym.checks import Spellings, check_mapping, check_path, require_regular
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.format import TASK, VERSION
+from fmugym.declared.frames import is_column, with_tables
 from fmugym.declared.seasons import read_scenarios
 from fmugym.declared.writing import as_toml, revised, write_new
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
@@ -147,7 +148,8 @@ class Task:
     ) -> Task:
         start = Path.cwd() if folder is None else check_path("folder", folder).absolute()
         _require_shallow(document)
-        plain: dict[str, Any] = _plain(check_mapping("config", document))
+        given = check_mapping("config", document)
+        plain: dict[str, Any] = _plain({**given, "data": with_tables(given.get("data"))})
         source = Source(None, start, "", _with_paths(plain, start))
         _check(source)
         if "extends" not in plain:
@@ -401,8 +403,7 @@ def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """The value in types that a file can hold, as far as that is possible."""
     if isinstance(value, Mapping):
-        items = _with_index(value)
-        return {str(key): _plain(item) for key, item in items.items() if item is not None}
+        return {str(key): _plain(item) for key, item in value.items() if item is not None}
     if isinstance(value, Uniform | LogUniform | Normal | Choice):
         return _plain(asdict(value))
     if isinstance(value, list | tuple):
@@ -413,7 +414,7 @@ def _plain(value: Any) -> Any:
         return value.astype("M8[us]").tolist()
     if isinstance(value, np.ndarray) and value.dtype.kind == "O" and value.ndim == 1:
         return [_plain(item) for item in value]
-    if _is_column(value):
+    if is_column(value):
         missing = [*value.isna()]
         return [None if gone else _plain(one) for one, gone in zip(value, missing, strict=True)]
     if isinstance(value, datetime.datetime) and hasattr(value, "to_pydatetime"):
@@ -421,19 +422,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, type):
         return _named(value)
     return os.fspath(value) if isinstance(value, os.PathLike) else value
-
-
-def _is_column(value: Any) -> bool:
-    """Whether a value is a column or an index of pandas."""
-    return getattr(value, "ndim", None) == 1 and hasattr(type(value), "isna")
-
-
-def _with_index(items: Mapping[Any, Any]) -> Mapping[Any, Any]:
-    """A table in which a column of pandas as ``values`` brings the dates of its index."""
-    index = getattr(items.get("values"), "index", None)
-    if not _is_column(index) or items.keys() & {"times", "step"}:
-        return items
-    return {**items, "times": index}
 
 
 def _named(value: type) -> Any:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_declared_weather import at, days_of, epw
 
-from fmugym import TaskError
+from fmugym import ConfigError, TaskError
 from fmugym.declared import Task
 from fmugym.declared.series import read_data
 from fmugym.errors import shown
@@ -294,6 +294,49 @@ class TestGaps:
                 read_data(task.root.child("data").child("p"))
             task = Task.from_dict({"data": {"p": given | {"gaps": "11h"}}})
             assert at(read_data(task.root.child("data").child("p")), 15) == 15
+
+    @pytest.mark.parametrize(
+        "given",
+        [
+            lambda frame: frame["load"],
+            lambda frame: frame[["load"]],
+            lambda frame: frame,
+            lambda frame: {"values": frame, "column": "load"},
+            lambda frame: {"values": frame, "column": 2},
+            lambda frame: {"values": frame["load"].to_numpy(), "times": frame.index},
+            lambda frame: {"values": frame["load"].to_numpy(), "step": "1h"},
+            lambda frame: {"values": frame["load"].reset_index(drop=True), "step": "1h"},
+        ],
+    )
+    def test_columns_frames_and_arrays(self, given):
+        pd = pytest.importorskip("pandas", reason="needs the extra pandas")
+        hours = pd.date_range("2023-01-01", periods=48, freq="h")
+        frame = pd.DataFrame({"price": 1.0, "load": np.arange(48.0) ** 2}, hours)
+        task = Task.from_dict({"data": {"load": given(frame)}})
+        read = read_data(task.root.child("data").child("load"))
+        assert [at(read, hour) for hour in range(48)] == [hour**2 for hour in range(48)]
+
+    @pytest.mark.parametrize(
+        ("given", "text"),
+        [
+            (
+                lambda frame: {"values": frame, "column": "lod"},
+                "data.p: .*'lod'; did you mean 'load'",
+            ),
+            (
+                lambda frame: {"values": frame, "column": 3},
+                "data.p: column = 3, but the frame has 2",
+            ),
+            (lambda frame: frame, "data.p: the frame has the columns 'price', 'load'"),
+            (lambda frame: frame["load"], "data.p: give either the 'step'"),
+            (lambda frame: frame["load"].to_numpy(), "data.p: give either the 'step'"),
+        ],
+    )
+    def test_columns_that_are_not_clear(self, given, text):
+        pd = pytest.importorskip("pandas", reason="needs the extra pandas")
+        frame = pd.DataFrame({"price": 1.0, "load": np.arange(48.0)})
+        with pytest.raises(ConfigError, match=text):
+            read_data(Task.from_dict({"data": {"p": given(frame)}}).root.child("data").child("p"))
 
 
 class TestRising:
