@@ -3,9 +3,6 @@
 import copy
 import itertools
 import json
-import os
-import subprocess
-import sys
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
@@ -59,12 +56,12 @@ def made(separable=False, seed=0, population=12, limits=(-30.0, 30.0)):
         return Optimizer(np.zeros(6), 0.5, limits, population, np.random.default_rng(seed))
 
 
-def went_on(search, rounds=3):
+def went_on(optimizer, rounds=3):
     """The candidates of some rounds, of which the first number decides."""
     found = []
     for _ in range(rounds):
-        found.append(search.ask())
-        search.tell(np.argsort(found[-1][:, 0]))
+        found.append(optimizer.ask())
+        optimizer.tell(np.argsort(found[-1][:, 0]))
     return np.array(found)
 
 
@@ -133,29 +130,6 @@ class TestOptimizer:
             with pytest.raises((KeyError, TypeError, ValueError, ArithmeticError, AssertionError)):
                 made(separable).restore(one)
         made(separable).restore(state)
-
-
-MANY_NUMBERS = """
-import numpy as np
-from fmugym.baselines.optimizer import Optimizer
-
-search = Optimizer(np.zeros(90), 1.0, (-30.0, 30.0), 32, np.random.default_rng(0))
-for _ in range(4):
-    candidates = search.ask()
-    search.tell(np.argsort(candidates[:, 0]))
-print(*candidates.ravel())
-"""
-
-
-def test_candidates_do_not_depend_on_the_processor():
-    """OpenBLAS rounds in another way with its code for another one; others ignore the variable."""
-    found = []
-    for kind in ("Prescott", "Haswell"):
-        environment = os.environ | {"OPENBLAS_CORETYPE": kind}
-        command = [sys.executable, "-c", MANY_NUMBERS]
-        found.append(subprocess.check_output(command, env=environment, text=True))
-    first, second = (np.array(text.split(), np.float64) for text in found)
-    assert first == pytest.approx(second, abs=1e-6)
 
 
 FALLING = {
