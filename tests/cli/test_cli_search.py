@@ -287,8 +287,8 @@ class TestCourse:
         facts = json.loads(arrays["text"].tobytes())
         damaged = [b"", b"broken", good[: len(good) // 2], npz(text=np.zeros(3)), npz()]
         damaged += [npz(**arrays | {"text": text_of(one)}) for one in mistakes(facts)]
-        kept = facts["policies"][0]["cma"]["state"].values()
-        for name in (one for one in kept if isinstance(one, str)):
+        state = facts["policies"][0]["cma"]["state"].values()
+        for name in (one for one in state if isinstance(one, str)):
             for wrong in (arrays[name][:-1], arrays[name] * np.nan, arrays[name].astype("f4")):
                 damaged.append(npz(**arrays | {name: wrong}))
         assert len(damaged) > 100
