@@ -30,7 +30,7 @@ class Entrant:
     """One search, and what has come of it.
 
     Attributes:
-        cma: The search, an ``Optimizer``; None for a controller whose numbers are known.
+        cma: The search, a ``CMA``; None for a controller whose numbers are known.
         make: Makes a controller for N environments from their numbers, shape (N, n). For
             validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.

@@ -10,9 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.cma import CMA
 from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.baselines.entrants import Entrant
-from fmugym.baselines.optimizer import Optimizer
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown
@@ -21,7 +21,7 @@ __all__ = ["Tuning", "entrant_of", "numbers_at", "tune"]
 
 _LEAST_CANDIDATES: Final = 8
 _SIGMA: Final = 0.1
-"""Of candidates after the first round, as a part of the ranges."""
+"""Of candidates after the first round, as a part of the ranges, at most."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def entrant_of(
     """
     first, others = sizes
     places = rng.uniform(size=(first, len(ranges)))
-    cma = Optimizer(places[0], _SIGMA, (0.0, 1.0), others, rng)
+    cma = CMA(places[0], _SIGMA, others, rng, growth=1.0)
     return Entrant(cma, make, episodes, first=places)
 
 
@@ -70,9 +70,11 @@ def numbers_at(
 
     Args:
         ranges: The range of each of the k numbers by name; it goes from place 0 to place 1.
-        places: For one place, of shape (k,), each is a number.
+        places: For one place, of shape (k,), each is a number. Those beyond 0 and 1 are folded
+            back.
     """
-    pairs = zip(ranges.items(), places.T, strict=True)
+    folded = 1.0 - np.abs(1.0 - np.mod(places, 2.0))
+    pairs = zip(ranges.items(), folded.T, strict=True)
     return {name: _value(given, column) for (name, given), column in pairs}
 
 
@@ -99,8 +101,9 @@ def tune(
     """Find the numbers with which a controller gets the largest rewards.
 
     In each round, all candidates play the same episodes side by side in one vector environment. The
-    first candidates are everywhere in the ranges. The next ones come from CMA-ES, which begins at
-    the best of them. The same arguments give the same result.
+    first candidates are everywhere in the ranges. The next ones come from the covariance matrix
+    adaptation of ``fmugym.baselines.cma``, which begins at the best of them. The same arguments
+    give the same result.
 
     Args:
         make_controller: Makes a controller from the numbers by keyword, such as

@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import Arena
+from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import Entrant
-from fmugym.baselines.optimizer import Optimizer
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
@@ -61,7 +61,10 @@ _FINEST: Final = 1e-3
 """The size of the weights of the finest ones; that of the coarsest ones is 1."""
 
 _LARGEST: Final = 30.0
-"""The largest magnitude of a weight."""
+"""The largest root mean square of the weights."""
+
+_GROWTH: Final = 5.0
+"""Steps become so many times as large as the first ones, at most."""
 
 _MERIT: Final = attrgetter("merit")
 
@@ -199,12 +202,12 @@ class Search:
             return entrant_of(agent, ranges, (_MANY, FEW), self.episodes, self.rng)
         return Entrant(self._cma(agent), agent, self.episodes, then)
 
-    def _cma(self, agent: Agent) -> Optimizer:
+    def _cma(self, agent: Agent) -> CMA:
         """The search for the weights of an agent, which begins with its own ones, or 0."""
         mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
         sigma = _OF_NETWORKS if agent.hidden else _OF_CORRECTIONS if agent.text else 1.0
         population = _MANY if agent.observed else FEW
-        return Optimizer(mean, sigma, (-_LARGEST, _LARGEST), population, self.rng)
+        return CMA(mean, sigma, population, self.rng, largest=_LARGEST, growth=_GROWTH)
 
     def _look(self, arena: Arena, baseline: Agent) -> None:
         """See what observations are like for the best of some candidates that correct the baseline.

@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import Entrant
-from fmugym.baselines.optimizer import Optimizer
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.errors import ConfigError
 from fmugym.search.policy import Agent
@@ -106,12 +106,8 @@ def _facts_of_entrant(one: Entrant, keep: Callable[[Any], str]) -> dict[str, Any
     }
 
 
-def _facts_of_cma(cma: Optimizer, keep: Callable[[Any], str]) -> dict[str, Any]:
-    state = cma.state().items()
-    return {
-        "population": cma.population,
-        "state": {n: keep(v) if isinstance(v, np.ndarray) else v for n, v in state},
-    }
+def _facts_of_cma(cma: CMA, keep: Callable[[Any], str]) -> dict[str, Any]:
+    return {n: keep(v) if isinstance(v, np.ndarray) else v for n, v in cma.state().items()}
 
 
 # Reading
@@ -213,13 +209,13 @@ class _Reader:
             **counts,
         )
 
-    def _cma(self, facts: Mapping[str, Any], size: int, search: Search) -> Optimizer:
-        population = _count(facts["population"])
-        if population < 2:
-            raise ValueError(f"{population} candidates")
-        cma = Optimizer(np.zeros(size), 1.0, (-np.inf, np.inf), population, search.rng)
-        state = facts["state"].items()
-        cma.restore({n: self._array(v) if isinstance(v, str) else v for n, v in state})
+    def _cma(self, facts: Mapping[str, Any], size: int, search: Search) -> CMA:
+        given = {n: self._array(v) if isinstance(v, str) else v for n, v in facts.items()}
+        mean, population = given["mean"], _count(given.pop("population"))
+        if mean.shape != (size,) or population < 2:
+            raise ValueError(f"{population} candidates of {mean.size} numbers, expected {size}")
+        cma = CMA(mean, 1.0, population, search.rng)
+        cma.restore(given)
         return cma
 
     def _array(self, name: Any, *shape: int | None) -> Any:

@@ -51,7 +51,7 @@ def _listed(config: EnvConfig) -> Iterator[str]:
 
 
 def class_formulas(
-    config: EnvConfig, interface: Interface, space: spaces.Space[Any]
+    config: EnvConfig, interface: Interface, space: spaces.Space[Any], has_inputs: bool
 ) -> Formulas | None:
     """Make the formulas of a class.
 
@@ -59,6 +59,8 @@ def class_formulas(
         config: The config.
         interface: The same with the variables of the FMU.
         space: The action space.
+        has_inputs: Whether a hook of the class makes the inputs. Then the expressions for them need
+            not fit the action space, which the class may have changed, too.
 
     Returns:
         None if the config has no expressions.
@@ -66,7 +68,9 @@ def class_formulas(
     Raises:
         ConfigError: If an expression does not fit; the text names the key, and all mistakes.
     """
-    return _ClassFormulas(config, interface, space).made() if config.expressions else None
+    if not config.expressions:
+        return None
+    return _ClassFormulas(config, interface, space).made(has_inputs)
 
 
 class _ClassFormulas:
@@ -78,15 +82,18 @@ class _ClassFormulas:
         self._mistakes: dict[str, None] = {}
         self._numbers = self._numbers_of_episodes()
 
-    def made(self) -> Formulas:
+    def made(self, has_inputs: bool) -> Formulas:
         """The formulas, in which no mistake is left."""
         config = self._config
+        inputs = self._inputs() if config.inputs else None
+        if self._mistakes and has_inputs:
+            inputs, self._mistakes = None, {}
         for name in _RESERVED.intersection(config.variable_starts):
             text = f"the episode variable {name!r} has a name with a meaning of its own"
             self._mistakes[f"{text} in expressions; rename it"] = None
         formulas = Formulas(
             self._graph,
-            self._inputs() if config.inputs else None,
+            inputs,
             [one for one in [self._updates()] if one],
             self._condition("terminated", config.terminated, is_judged=False),
             self._condition("truncated", config.truncated),

@@ -215,7 +215,10 @@ class Constructed(Pictured):
     def _prepare_formulas(self) -> None:
         inside = self.inside
         if inside.formulas is None:
-            inside.formulas = class_formulas(self.config, inside.interface, self.action_space)
+            has_inputs = is_overridden(self, inside.base, "_get_inputs")
+            inside.formulas = class_formulas(
+                self.config, inside.interface, self.action_space, has_inputs
+            )
             if self.config.terminated is None and not is_overridden(self, inside.base, "_is_done"):
                 raise ConfigError(
                     f"{type(self).__name__} does not say when the task has ended: give the config "

@@ -161,7 +161,7 @@ def install(folder: Path, library: Library) -> Path:
     run([*pip, library.package, *library.more], check=True)
     if library.over:
         run([*pip, "--no-deps", *library.over], check=True)
-        run([*pip, "cmaes", "fmpy", "pint", "pygame", "tomlkit"], check=True)
+        run([*pip, "fmpy", "pint", "pygame", "tomlkit"], check=True)
     run([*pip, *(["--no-deps"] if library.over else []), toolbox], check=True)
     return python
 
