@@ -246,27 +246,6 @@ class Pool:
         those of ``play``.
         """
 
-    def step_one(
-        self,
-        judge: Callable[[], Any],
-        complete: Callable[[Any], Any] | None,
-        action: Any,
-        /,
-    ) -> Any:
-        """Do a whole step of a single environment, by a pool of one.
-
-        Args:
-            judge: Returns the result if the instance has stepped, but its status or a number is not
-                good.
-            complete: Makes the result of a good step whole; None if it is that already.
-            action: Of the environment.
-
-        Returns:
-            The result of the step: a tuple of the class that ``prepare_play`` has got. None if
-            nothing was done: the episode has ended, the action is not of the type that was
-            prepared, or inputs are not finite. An exception ends the episode.
-        """
-
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
         """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
 

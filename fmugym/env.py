@@ -12,7 +12,6 @@ from importlib import import_module
 from typing import Any, ClassVar, Final, Never
 
 import gymnasium
-import numpy as np
 from gymnasium import logger as gymnasium_logger
 from gymnasium.envs.registration import EnvSpec
 
@@ -51,8 +50,8 @@ __all__ = [
 
 _ARGUMENTS: Final = (*("fmu_path", "config", "log_level", "render_mode", "backend", "isolation"),)
 
-_PLAYERS: Final = "fmugym.vector.one"
-"""The module of players is imported late: it needs this one, and takes a while."""
+_COMPILED: Final = "fmugym.vector.single"
+"""The module of compiled steps is imported late: it needs this one, and takes a while."""
 
 
 class FMUEnv(Constructed):
@@ -62,7 +61,8 @@ class FMUEnv(Constructed):
     ``FMI1MEEnv``, ``FMI2MEEnv`` or ``FMI3MEEnv`` for model exchange, and supplies ``_is_done``;
     every other hook of ``fmugym.task.hooks.Hooks`` has a default. A step calls the hooks once each,
     in the order in which they stand there. All but ``_get_inputs`` and ``_update`` must be free of
-    side effects. None may draw random numbers; random values are distributions in the config.
+    side effects. None should draw random numbers, which no snapshot and no vector environment would
+    repeat; random values are distributions in the config.
 
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.
@@ -73,7 +73,7 @@ class FMUEnv(Constructed):
     An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
     already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
     the episode as it was; it becomes a ``ConfigError`` if it comes from an action that is not in
-    the action space.
+    the action space. Inputs of expressions that are not finite end the episode.
 
     Args:
         fmu_path: The FMU, or a system: the path of an ``.ssp`` file, or an ``FMUSystem``. A
@@ -93,7 +93,8 @@ class FMUEnv(Constructed):
         config: The checked config.
         state: The outputs in the order of the config, floats.
         out: The outputs and the monitored variables by name, a read-only mapping.
-        action: The action of this step as it was given; zeros after a reset.
+        action: The action of this step as it was given, or, where there are expressions, in the
+            type of the action space; zeros after a reset.
         inputs: The FMU's inputs in this step, floats.
         previous_state: ``state`` before this step.
         previous_action: The action of the step before; zeros in the first.
@@ -152,7 +153,7 @@ class FMUEnv(Constructed):
         self._construct(FMUEnv, fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
         if self.inside.formulas is not None:
-            import_module(_PLAYERS)  # so that the first reset does not wait for it
+            import_module(_COMPILED)  # so that the first reset does not wait for it
 
     # Gymnasium's interface.
 
@@ -204,10 +205,10 @@ class FMUEnv(Constructed):
         inside.ended = True  # there is no episode if the FMU fails
         try:
             BeginningOfOne(self, draws, episode).begin()
-            inside.was_reset, inside.ended, inside.in_hooks = True, False, False
+            inside.was_reset, inside.ended = True, False
             observation, info = first_observation(self)
-            if not inside.has_chosen:
-                self._choose_player(pool)
+            if not inside.has_compiled:
+                self._compile(pool)
         except BaseException:
             inside.ended = True
             inside.halt()
@@ -217,13 +218,12 @@ class FMUEnv(Constructed):
             self.render()
         return observation, info
 
-    def _choose_player(self, pool: Pool) -> None:
+    def _compile(self, pool: Pool) -> None:
         """Compile the expressions that the hooks are, where a native pool can run them."""
-        inside = self.inside
-        inside.has_chosen = True
-        is_plain = not (inside.own.step or inside.own.reset) and pool.num_instances == 1
-        if inside.formulas is not None and is_plain and pool.plays_alone:
-            inside.player = import_module(_PLAYERS).player_of(self)
+        own, self.inside.has_compiled = self.inside.own, True
+        is_alone = pool.num_instances == 1 and pool.plays_alone
+        if self.inside.formulas is not None and is_alone and not (own.step or own.reset):
+            self.inside.compiled_step = import_module(_COMPILED).expression_step_of(self)
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
@@ -243,30 +243,19 @@ class FMUEnv(Constructed):
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
                 and, with ``on_fault="raise"``, after a fault.
         """
-        player = self.inside.player
-        if self.render_mode is None:
-            result = self._step_in_python(action) if player is None else player.step(action)
-            if result is not None:
-                return result
-        return FMUEnv._step(self, action)
-
-    def _step(self, action: Any) -> Result:
-        """Let the pool do the whole step where it can, and note what a picture shows."""
-        player = self.inside.player
-        result: Result | None = None if player is None else player.play(self, action)
-        if result is None:
+        inside = self.inside
+        if inside.ended:
+            self._check_before_step()
+        if inside.compiled_step is None or inside.ended:
             result = self._step_in_python(action)
+        else:
+            result = inside.compiled_step.step(self, action)
         if self.render_mode is not None:
             note_for_picture(self, result[1])
         return result
 
     def _step_in_python(self, action: Any) -> Result:
         inside = self.inside
-        if inside.player is not None:
-            inside.keep()
-        if inside.ended:
-            self._check_before_step()
-        inside.in_hooks = True
         try:
             take_action(self, action)
             try:
@@ -279,8 +268,6 @@ class FMUEnv(Constructed):
         except BaseException:  # a real system must not go on without its controller
             inside.halt()
             raise
-        finally:
-            inside.in_hooks = False
 
     def _check_before_step(self) -> None:
         self._open_pool("step")
@@ -333,7 +320,6 @@ class FMUEnv(Constructed):
         pool = self._open_pool("save_state")
         if not self.inside.was_reset:
             raise SimulationError("save_state was called before the first reset")
-        self.inside.keep()
         bundle = pool.save_instances(FIRST)
         return Snapshot(scope_of(self), columns_of(self), bundle)
 
@@ -355,14 +341,13 @@ class FMUEnv(Constructed):
         if not self.inside.was_reset:
             prepare_hooks(self)  # as in ``reset``
         require_saving(pool)
-        self.inside.keep()
         self.inside.ended = True  # there is no episode if the FMU fails
         if pool.restore_instances(snapshot.bundle, FIRST, FIRST)[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         observation = first_observation(self)[0]
-        if not self.inside.has_chosen:
-            self._choose_player(pool)
+        if not self.inside.has_compiled:
+            self._compile(pool)
         return observation
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
@@ -423,21 +408,6 @@ class FMUEnv(Constructed):
         variables = readable_named(self.fmu.description, names)
         values = pool.read(variables)[:, 0].tolist()
         return {one.name: value for one, value in zip(variables, values, strict=True)}
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        """The environment's generator; hooks must not use it."""
-        if self.inside.in_hooks:
-            raise SimulationError(
-                "a hook drew random numbers; give a distribution in the config under "
-                "'model_parameters' or 'episode_variables' instead and read the drawn value"
-            )
-        return super().np_random
-
-    @np_random.setter
-    def np_random(self, value: np.random.Generator) -> None:
-        self._np_random = value
-        self._np_random_seed = -1
 
     @property
     def np_random_seed(self) -> int:

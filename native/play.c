@@ -82,28 +82,6 @@ void play_open(const Turn *turn, PlayScratch *scratch) {
     program_prepare(&turn->play->judgement, scratch->memory, &scratch->judgement);
 }
 
-bool play_makes_inputs(Turn *turn) {
-    const Play *play = turn->play;
-    const size_t number = play->number_of_inputs * play->count, bytes = number * sizeof(double);
-    Source source = source_of(turn);
-    Notes notes = {.outside = false};
-    PlayScratch scratch;
-
-    source.actions = turn->actions;
-    source.previous_actions = play->actions.current;
-    memcpy(play->inputs_before, play->input_rows, bytes);
-    program_prepare(&play->inputs, scratch.memory, &scratch.inputs);
-    program_run(&play->inputs, &source, 0, play->count, &scratch.inputs, &notes);
-    for (size_t i = 0; i < number; i++) {
-        notes.outside |= !(fabs(play->input_rows[i]) <= DBL_MAX);
-    }
-    turn->has_inputs = !notes.outside;
-    if (notes.outside) {
-        memcpy(play->input_rows, play->inputs_before, bytes);
-    }
-    return turn->has_inputs;
-}
-
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
     const Actions *a = &turn->play->actions;
     const size_t size = a->elements * a->size, offset = begin * size;
@@ -135,10 +113,8 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     if (play->actions.current != NULL) {
         take_actions(turn, begin, count);
     }
-    if (!turn->has_inputs) {
-        const Source source = source_of(turn);
-        program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
-    }
+    const Source source = source_of(turn);
+    program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
     if (play->reads_kept) {
         play_keep_outputs(play, 0, play->number_of_outputs, begin, count);
     }

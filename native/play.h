@@ -57,7 +57,7 @@ typedef struct {
     Program judgement; /* stores the rest; its results are done, truncated, reward */
     Source source;     /* only the statuses; each step sets the rest */
     Actions actions;
-    double *input_rows, *inputs_before;
+    double *input_rows;
     const InputStart *input_starts;
     size_t number_of_inputs;
     const double *output_rows;
@@ -84,7 +84,6 @@ typedef struct {
 typedef struct {
     const Play *play;
     const char *actions;
-    bool has_inputs; /* whether they are made already */
     const double *offsets; /* what is added to the outputs of each instance, or NULL */
     double *rewards;
     uint8_t *terminated, *truncated;
@@ -98,10 +97,6 @@ typedef struct {
 
 /* Whether an action of so many steps is out of range or NaN. */
 bool play_has_bad_action(const Turn *turn, size_t steps);
-
-/* Makes the inputs before anything else of a step, which then has them. If they are not finite, returns
- * false and leaves them as they were. */
-bool play_makes_inputs(Turn *turn);
 
 /* Scratch memory of one thread. */
 typedef struct {

@@ -94,7 +94,6 @@ static void read_input_starts(Reader *reader, PlayForm *p) {
     const double *values = read_array(reader, sizeof *values, &constants);
 
     play->input_starts = p->input_starts = room_for(reader, count, sizeof *p->input_starts);
-    play->inputs_before = room_for(reader, count * play->count, sizeof *play->inputs_before);
     play->number_of_inputs = count;
     if (constants != count) {
         reader_refuse(reader, "the inputs differ in number");
@@ -188,6 +187,5 @@ void play_drop(PlayForm *p) {
     free(p->variable_starts);
     free(p->drawn_variables);
     free(p->input_starts);
-    free(p->play.inputs_before);
     free(p->form);
 }

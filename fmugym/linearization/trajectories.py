@@ -363,7 +363,6 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
 
 def _inputs_of(env: FMUEnv, action: Any) -> tuple[float, ...]:
     """What the FMU's inputs would be with an action; they stay in the pool."""
-    env.inside.keep()
     read, writer = env.inside.readings, env.inside.input_writer
     before = read.action, read.previous_action, read.previous_state, read.inputs
     read.previous_action, read.previous_state, read.action = read.action, read.state, action

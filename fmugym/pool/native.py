@@ -319,11 +319,6 @@ class NativePool(AskingPool):
         """
         return self._open_pool().rollout(*arrays)
 
-    @property
-    def step_one(self) -> Callable[..., Any]:
-        """See ``_native.Pool.step_one``."""
-        return self._pool.step_one
-
 
 def prepare(
     pool: _native.Pool,

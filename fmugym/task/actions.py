@@ -16,7 +16,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.task.spaces import to_input_types
 
-__all__ = ["elements_of", "flat_inputs", "no_action", "take_action"]
+__all__ = ["as_element", "elements_of", "flat_inputs", "no_action", "take_action"]
 
 _OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 """The exceptions that indexing and arithmetic raise for values of a wrong kind or shape."""
@@ -68,13 +68,11 @@ def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
         ConfigError: If it cannot be used. Then nothing has happened.
     """
     inside, read = env.inside, env.inside.readings
-    elements = inside.elements
-    if elements is not None and isinstance(action, bool | np.bool_):
-        action = int(action)  # an element for Gymnasium, but no index for hooks
+    elements, action = inside.elements, _no_truth(env, action)
     if elements is None or type(action) not in _INTEGERS or action not in elements:
         _require_usable(env, action)
-        if "_get_inputs" in inside.expressed:
-            action = _of_shape(action, env.action_space)  # expressions read its elements
+        if inside.expressed and not inside.own.step:
+            action = as_element(env, action)[()]  # expressions read its elements
     before = read.action, read.previous_action, read.previous_state, read.inputs
     read.previous_action, read.previous_state, read.action = read.action, read.state, action
     try:
@@ -87,6 +85,29 @@ def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
         raise
     inside.input_writer.write(read.inputs, inside.input_row)
     return before
+
+
+def as_element(env: Any, action: Any) -> npt.NDArray[Any]:
+    """The action in the shape and the type of the action space.
+
+    Raises:
+        ConfigError: If it does not fit.
+    """
+    space, action = env.action_space, _no_truth(env, action)
+    _require_usable(env, action)
+    if env.inside.elements is not None:
+        return np.array(operator.index(action), space.dtype)
+    array = np.asarray(_of_shape(action, space))
+    if array.dtype.kind == "f" and space.dtype.kind != "f":
+        raise ConfigError(f"action {shown(action)} is not in {space}: expected integers")
+    with np.errstate(over="ignore"):  # an input becomes infinite, and is refused
+        return array.astype(space.dtype)
+
+
+def _no_truth(env: Any, action: Any) -> Any:
+    """The integer for a truth: an element of a ``Discrete`` for Gymnasium, but no index."""
+    is_truth = env.inside.elements is not None and isinstance(action, bool | np.bool_)
+    return int(action) if is_truth else action
 
 
 def _require_usable(env: Any, action: Any) -> None:

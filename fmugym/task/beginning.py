@@ -111,23 +111,12 @@ class BeginningOfOne(Beginning):
     def clear(self, inputs: list[Any], action: Any) -> None:
         """See ``Beginning.clear``."""
         inside, episode = self.env.inside, self.episode
-        if inside.player is not None:
-            inside.player.begin()
-        read = inside.readings = inside.own_readings
-        read.parameters = episode.parameters
-        if episode.variables:
-            read.variables.update(episode.variables)
+        inside.readings.begin(inputs, action, episode.parameters, episode.variables)
         inside.pictured = None, 0.0
-        read.inputs, read.step_count = tuple(inputs), 0
-        read.action = read.previous_action = action
-        read.done = read.after_end = False
 
     def look(self) -> None:
         """See ``Beginning.look``."""
-        inside = self.env.inside
-        read = inside.readings
-        read.values = tuple(inside.output_row.tolist())
-        read.state = read.previous_state = read.values[: inside.output_count]
+        self.env.inside.readings.look(self.env.inside.output_row)
 
     def readings(self, indices: IndexArray) -> Readings:
         """See ``Beginning.readings``."""

@@ -170,7 +170,7 @@ class Constructed(Pictured):
         self.inside.output_count = len(interface.outputs)
         self.inside.no_monitors = not interface.monitors
         self.inside.start_inputs = [(v.name, v.start_number) for v in interface.inputs]
-        self.inside.readings = self.inside.own_readings = self._first_readings(names)
+        self.inside.readings = self._first_readings(names)
 
     def _first_readings(self, names: Sequence[str]) -> Readings:
         values = (nan,) * len(names)

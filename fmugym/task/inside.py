@@ -92,8 +92,9 @@ class Inside:
         step_pool, halt, input_row, output_row: Parts of the pool that each step needs.
         observation_row: The pool's observation of this environment.
         pool_tells: Whether the pool adds to the info of a step.
-        player: Steps the environment if its hooks are compiled; or None.
-        has_chosen: Whether it is known if there is a player.
+        compiled_step: The step by programs, if the hooks are expressions and a native pool steps
+            the FMU; or None.
+        has_compiled: Whether it is known if there is such a step.
         draws: What is drawn for an episode.
         quantities: Lists what a declared task has names for; None for other tasks.
         formulas: What the task computes, as far as expressions say it; None without expressions.
@@ -105,10 +106,8 @@ class Inside:
         held: Returns the outputs that a plant has not told now, whose last values go on.
         own: The hooks that the class has itself.
         readings: What hooks read now.
-        own_readings: What they read in an episode that Python steps.
         standing_in: Held while other values stand in for those that hooks read: threads that do so
             at once would put back each other's.
-        in_hooks: Whether hooks are being called, which must not draw random numbers.
         is_closed: Whether the environment is.
         was_reset, ended: Whether there was an episode, and whether there is none that goes on.
         output_count: The number of outputs, without monitored variables.
@@ -135,6 +134,7 @@ class Inside:
     action_values: Sequence[int] | None
     as_constructed: dict[str, Any]
     base: type
+    compiled_step: Any
     elements: Any
     ended: bool
     expressed: Mapping[str, Callable[[Any], Any]]
@@ -144,9 +144,8 @@ class Inside:
     model: Callable[[], Any] | None
     held: Callable[[], Sequence[str]]
     halt: Callable[[], None]
-    has_chosen: bool
+    has_compiled: bool
     has_info: bool
-    in_hooks: bool
     input_row: FloatArray
     input_writer: InputWriter
     interface: Interface
@@ -162,10 +161,8 @@ class Inside:
     output_row: FloatArray
     own: OwnHooks
     own_names: frozenset[str]
-    own_readings: Readings
     pictured: tuple[float | None, float]
     draws: EpisodeDraws
-    player: Any
     pool: Pool
     pool_observes: bool
     pool_tells: bool
@@ -185,11 +182,11 @@ class Inside:
 
     def __init__(self, number: int) -> None:
         self.number, self.own_names = number, frozenset()
-        self.pool_tells = self.has_info = self.has_chosen = False
-        self.in_hooks = self.was_reset = self.is_closed = False
+        self.pool_tells = self.has_info = self.has_compiled = False
+        self.was_reset = self.is_closed = False
         self.standing_in = RLock()
         self.ended = True
-        self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
+        self.warm_ups = self.compiled_step = self.quantities = self.renderer = self.scope = None
         self.formulas, self.expressed, self.variable_starts = None, {}, {}
         self.future = self.controllers = self.model = None
         self.held = lambda: ()
@@ -213,12 +210,7 @@ class Inside:
     def close_pool(self) -> None:
         """Close the pool, if one is open; hooks then read what the latest step has left."""
         if self.is_open:
-            self.keep()
-            self.player, self.has_chosen, self.ended = None, False, True
+            self.readings, self.ended = self.readings.copy(), True
+            self.compiled_step, self.has_compiled = None, False
             self.pool.close()
             del self.pool
-
-    def keep(self) -> None:
-        """Keep what hooks read in an object of its own, not in the pool, until the next step."""
-        if self.player is not None:
-            self.player.keep(self)

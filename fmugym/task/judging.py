@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import hypot, isfinite
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE, Status
@@ -15,13 +14,10 @@ from fmugym.task.step import NUMBERS, conclude
 
 __all__ = [
     "Result",
-    "after_step",
     "first_observation",
     "judged",
     "not_finite",
 ]
-
-R = TypeVar("R")
 
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated and info."""
@@ -69,19 +65,6 @@ def judged(env: Constructed, status: int, values: tuple[float, ...] | None = Non
     return observation, reward, terminated, truncated, info
 
 
-def after_step(env: Constructed, function: Callable[..., R], *args: Any) -> R:
-    """Call hooks when the FMU has stepped: after an exception, the episode does not go on."""
-    env.inside.in_hooks = True
-    try:
-        return function(env, *args)
-    except BaseException:
-        env.inside.ended = True
-        env.inside.halt()
-        raise
-    finally:
-        env.inside.in_hooks = False
-
-
 def info_of(env: Constructed) -> dict[str, Any]:
     """The info of the hook and of the pool."""
     info = as_info(env._get_info())
@@ -97,15 +80,10 @@ def first_observation(env: Constructed) -> tuple[Any, dict[str, Any]]:
         ConfigError: If a hook returns something unusable.
         SimulationError: If the observation is not finite.
     """
-    inside = env.inside
-    inside.in_hooks = True
-    try:
-        observation = env._get_observation()
-        if not inside.is_finite(observation):
-            raise SimulationError(f"the first observation is not finite: {shown(observation)}")
-        return observation, info_of(env) if inside.has_info else {}
-    finally:
-        inside.in_hooks = False
+    observation = env._get_observation()
+    if not env.inside.is_finite(observation):
+        raise SimulationError(f"the first observation is not finite: {shown(observation)}")
+    return observation, info_of(env) if env.inside.has_info else {}
 
 
 def _fault_of_hooks(

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-__all__ = ["changed", "plain_attributes", "same"]
+__all__ = ["changed", "plain_attributes", "put_back", "same"]
 
 _LARGEST: Final = 2**20
 """Arrays of more bytes are taken for data that hooks only read."""
@@ -29,6 +29,14 @@ def plain_attributes(attributes: Mapping[str, Any], foreign: Collection[str]) ->
         for name, value in attributes.items()
         if name not in foreign and _is_plain(value)
     }
+
+
+def put_back(env: Any, attributes: Mapping[str, Any]) -> None:
+    """Give an environment the attributes that it had before, and no others."""
+    now = vars(env)
+    for name in now.keys() - attributes.keys():
+        del now[name]
+    now.update(attributes)
 
 
 def changed(now: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:

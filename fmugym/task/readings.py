@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError
+from fmugym.pool.base import FloatArray
 from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
 
 __all__ = [
@@ -53,12 +54,34 @@ class Readings:
     parameters: Mapping[str, Any]
     variables: EpisodeVariables
 
-    @classmethod
-    def of(cls, env: Any) -> Readings:
-        """Return what the hooks of an environment read now; the values are not copied."""
-        env.inside.keep()
-        present: Readings = env.inside.readings
-        return replace(present)
+    def begin(
+        self,
+        inputs: Sequence[float],
+        action: Any,
+        parameters: Mapping[str, Any],
+        variables: Mapping[str, Any],
+    ) -> None:
+        """Begin the episode of a single environment; its outputs follow with ``look``.
+
+        Args:
+            inputs: The inputs before the first step.
+            action: What stands for the action of a step.
+            parameters: By name.
+            variables: By name.
+        """
+        self.inputs, self.parameters, self.step_count = tuple(inputs), parameters, 0
+        self.action = self.previous_action = action
+        self.done = self.after_end = False
+        dict.update(self.variables, variables)
+
+    def look(self, outputs: FloatArray) -> None:
+        """Take the outputs and monitored variables of a single environment that has not stepped."""
+        self.values = tuple(outputs.tolist())
+        self.state = self.previous_state = self.values[: len(self.state)]
+
+    def copy(self) -> Readings:
+        """The same readings in an object of their own; the values are not copied."""
+        return replace(self)
 
     def mapped(self, each: Callable[[Any], Any]) -> Readings:
         """The same readings with what a function makes of each value."""
@@ -66,7 +89,7 @@ class Readings:
         variables.update({name: each(value) for name, value in self.variables.items()})
         parameters = ParameterValues((n, each(value)) for n, value in self.parameters.items())
         result = replace(
-            self,
+            self.copy(),
             values=each(self.values),
             parameters=MappingProxyType(parameters),
             variables=variables,
@@ -118,7 +141,6 @@ def read_by(name: str, get: Callable[[Any], Any]) -> Any:
     """
 
     def put(env: Any, value: Any) -> None:
-        env.inside.keep()
         setattr(env.inside.readings, name, value)
 
     return property(get, put)

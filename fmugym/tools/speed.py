@@ -108,7 +108,7 @@ def _of_single(env: FMUEnv, seconds: float) -> Speed:
     env.reset(seed=0)
     _fastest(step, seconds / 4)
     took = _fastest(step, seconds)
-    hooks = "Python" if env.inside.player is None else "expressions"
+    hooks = "Python" if env.inside.compiled_step is None else "expressions"
     env.reset(seed=0)
     return Speed(0, hooks, 1.0 / took, took * 1e6, _share(env, seconds, took))
 

@@ -12,15 +12,35 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool.base import FloatArray
 from fmugym.task.construction import draws_of
+from fmugym.task.readings import READINGS
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.calls import TOGETHER, require_settable
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
 
-__all__ = ["Attributes"]
+__all__ = ["Attributes", "require_settable"]
+
+_TOGETHER: Final = frozenset({"close", "reset", "step"})
+"""Methods that one environment cannot do alone."""
+
+_KEPT_FOR_ALL: Final = frozenset(READINGS) | {
+    *("action_space", "config", "fmu", "logger", "metadata", "observation_space"),
+    *("render_mode", "spec"),
+}
+"""Attributes that ``FMUEnv`` sets itself."""
 
 _NAME: Final = "the name of an attribute"
+
+
+def require_settable(name: str) -> None:
+    """Refuse to set what the environments themselves keep.
+
+    Raises:
+        ConfigError: If the name is one of ``FMUEnv``'s own.
+    """
+    declared = any(name in vars(cls).get("__annotations__", ()) for cls in FMUEnv.__mro__)
+    if name in _KEPT_FOR_ALL or hasattr(FMUEnv, name) or declared:
+        raise ConfigError(f"{name!r} cannot be set: every environment keeps it itself")
 
 
 class Attributes:
@@ -49,7 +69,7 @@ class Attributes:
     ) -> list[Any]:
         """Call a method of some environments; see ``FMUVectorEnv.call``."""
         name = check_text(_NAME, name)
-        if name in TOGETHER:
+        if name in _TOGETHER:
             raise ConfigError(f"{name!r} cannot be called on single environments of many")
         if name == "render":
             return self.render(indices)

@@ -133,7 +133,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             )
             try:
                 env.inside.use(self.inside.pool)
-                env.inside.has_chosen = True  # to be stepped by an engine
                 self._set_up(max_episode_steps)
             except BaseException:
                 self.inside.pool.close()

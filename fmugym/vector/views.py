@@ -1,7 +1,8 @@
-"""What hooks read in a batch of N environments, and in one environment of it."""
+"""The readings of a batch of N environments, and of one environment of it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -9,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 from fmugym.task.readings import Readings
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.values import EpisodeVariables, ParameterValues
 
-__all__ = ["batched", "column", "some", "take"]
+__all__ = ["ColumnReadings", "batched", "some", "take"]
 
 
 def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) -> Readings:
@@ -57,17 +60,128 @@ def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> 
     return batch.mapped(lambda values: np.array(np.asarray(values)[..., which]))
 
 
-def column(batch: Readings, index: int) -> Readings:
-    """Return what the hooks of one environment of a batch read, as Python's numbers."""
-    one = batch.mapped(lambda row: take(row, index))
-    for name in ("values", "previous_state", "inputs", "step_count", "done", "after_end"):
-        numbers = getattr(one, name).tolist()
-        setattr(one, name, tuple(numbers) if isinstance(numbers, list) else numbers)
-    one.state = one.values[: len(batch.state)]
-    return one
-
-
 def take(values: Any, index: int) -> Any:
     """Take one environment's part of an array that has the environments in its last axis."""
     part = np.asarray(values)[..., index]
     return part.item() if part.ndim == 0 and part.dtype.kind == "f" else part[()]
+
+
+def _column_property(name: str, make: Callable[[npt.NDArray[Any]], Any]) -> Any:
+    """A property that makes a value of an environment's part of an array, and writes there."""
+
+    def get(self: ColumnReadings) -> Any:
+        return make(getattr(self.batch, name)[..., self.index])
+
+    def put(self: ColumnReadings, value: Any) -> None:
+        getattr(self.batch, name)[..., self.index] = value
+
+    return property(get, put)
+
+
+def _numbers(part: npt.NDArray[Any]) -> tuple[float, ...]:
+    return tuple(part.tolist())
+
+
+class ColumnReadings(Readings):
+    """The readings of one of N environments: its column of their arrays.
+
+    Values are numbers of Python, made of the arrays when they are read. What is written goes to the
+    arrays.
+
+    Args:
+        batch: The readings of all.
+        index: The environment.
+    """
+
+    __slots__ = ("_parameters", "batch", "index")
+
+    def __init__(self, batch: Readings, index: int) -> None:
+        self.batch, self.index = batch, index
+        self._parameters: Mapping[str, Any] | None = None  # as they were set
+        values = batch.values
+        self.out = batch.out.over(lambda: _numbers(values[:, index]))
+
+    values: Any = _column_property("values", _numbers)
+    state: Any = _column_property("state", _numbers)
+    previous_state: Any = _column_property("previous_state", _numbers)
+    inputs: Any = _column_property("inputs", _numbers)
+    action: Any = _column_property("action", lambda part: part[()].copy())
+    previous_action: Any = _column_property("previous_action", lambda part: part[()].copy())
+    step_count: Any = _column_property("step_count", lambda part: part.item())
+    done: Any = _column_property("done", lambda part: part.item())
+    after_end: Any = _column_property("after_end", lambda part: part.item())
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """The parameters of the episode by name."""
+        if self._parameters is not None:
+            return self._parameters
+        rows = self.batch.parameters.items()
+        return MappingProxyType(ParameterValues((n, take(row, self.index)) for n, row in rows))
+
+    @parameters.setter
+    def parameters(self, values: Mapping[str, Any]) -> None:
+        self._parameters = values
+        for name, row in self.batch.parameters.items():
+            row[self.index] = values[name]
+
+    @property
+    def variables(self) -> EpisodeVariables:  # type: ignore[override]  # written in place
+        """The episode variables by name."""
+        return _ColumnVariables(self.batch.variables, self.index)
+
+    def begin(
+        self,
+        inputs: Sequence[float],
+        action: Any,
+        parameters: Mapping[str, Any],
+        variables: Mapping[str, Any],
+    ) -> None:
+        """See ``Readings.begin``."""
+        batch, index = self.batch, self.index
+        batch.inputs[:, index], batch.step_count[index] = inputs, 0
+        batch.action[..., index] = batch.previous_action[..., index] = action
+        batch.done[index] = batch.after_end[index] = False
+        self.parameters = parameters
+        for name, value in variables.items():
+            batch.variables[name][..., index] = value
+
+    def look(self, outputs: FloatArray) -> None:
+        """See ``Readings.look``; the arrays have the outputs already."""
+        self.batch.previous_state[:, self.index] = self.batch.state[:, self.index]
+
+    def copy(self) -> Readings:
+        """See ``Readings.copy``."""
+        values = {name: getattr(self, name) for name in Readings.__slots__}
+        values["variables"] = EpisodeVariables(self.variables)
+        values["variables"].update(self.variables)
+        values["out"] = self.out.over(lambda: values["values"])
+        return Readings(**values)
+
+
+class _ColumnVariables(EpisodeVariables):
+    """The episode variables of one of N environments; what is written goes to their arrays."""
+
+    def __init__(self, rows: Mapping[str, npt.NDArray[Any]], index: int) -> None:
+        dict.__init__(self, {name: take(row, index) for name, row in rows.items()})
+        self._rows, self._index = rows, index
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        super().__setitem__(name, value)
+        self._write()
+
+    def update(self, *args: Any, **kwargs: Any) -> None:
+        """See ``EpisodeVariables.update``."""
+        super().update(*args, **kwargs)
+        self._write()
+
+    def _write(self) -> None:
+        for name, value in self.items():
+            part = self._rows[name][..., self._index]
+            try:
+                part[...] = value
+            except (TypeError, ValueError):
+                raise ConfigError(
+                    f"the episode variable {name!r} was set to {shown(value)}, expected "
+                    f"{part.size} numbers"
+                ) from None

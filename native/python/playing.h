@@ -64,8 +64,8 @@ typedef struct {
 bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size);
 
 /* Takes an array of actions. Those of another type or shape come back as an exception; the caller then
- * converts them. A first axis of 1 leaves that of the environments out. */
-bool take_array_of_actions(const Playing *playing, PyObject *actions, int first, Py_buffer *buffer);
+ * converts them. */
+bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer *buffer);
 
 /* Clears what is used of the many buffers. */
 void clear_turn(const Playing *playing, PyTurn *t);

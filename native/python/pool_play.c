@@ -28,15 +28,15 @@ static bool has_letter(const Py_buffer *buffer, int letter) {
     return *format != '\0' && format[1] == '\0' && (*format == letter || is_long);
 }
 
-bool take_array_of_actions(const Playing *playing, PyObject *actions, int first, Py_buffer *b) {
+bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer *b) {
     if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
         return false;
     }
-    bool fits = b->ndim == playing->action_dimensions - first &&
+    bool fits = b->ndim == playing->action_dimensions &&
                 has_letter(b, playing->action_letter) &&
                 b->itemsize == (Py_ssize_t)playing->form.play.actions.size;
     for (int i = 0; fits && i < b->ndim; i++) {
-        fits = b->shape[i] == playing->action_shape[first + i];
+        fits = b->shape[i] == playing->action_shape[i];
     }
     if (!fits || (uintptr_t)b->buf % (uintptr_t)b->itemsize != 0) {
         PyErr_SetString(PyExc_TypeError, "the actions have another type or shape");
@@ -188,7 +188,7 @@ static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *act
     bool done = false;
 
     clear_turn(playing, &t);
-    if (take_array_of_actions(playing, actions, 0, &t.buffers[ACTIONS])) {
+    if (take_array_of_actions(playing, actions, &t.buffers[ACTIONS])) {
         settle_turn(self, playing, &t);
         done = play_turn(self, BEFORE, &t);
     }
@@ -227,7 +227,7 @@ static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObj
 
     clear_turn(playing, &t);
     if (provide(playing->results, starts, at_ends, &arrays) &&
-        take_array_of_actions(playing, actions, 0, &t.buffers[ACTIONS])) {
+        take_array_of_actions(playing, actions, &t.buffers[ACTIONS])) {
         settle_step(self, playing, starts, at_ends, &arrays, &t);
         result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }

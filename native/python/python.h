@@ -91,6 +91,5 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play_before(PyObject *object, PyObject *actions);
 PyObject *py_play_after(PyObject *object, PyObject *actions);
 
-PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 #endif

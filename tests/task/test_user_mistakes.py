@@ -429,19 +429,6 @@ def one_step(env):
 
 
 class TestHooks:
-    @pytest.mark.parametrize(
-        "hook",
-        ["_is_done", "_reward_policy", "_get_observation", "_get_info", "_get_inputs", "_update"],
-    )
-    def test_that_draw_random_numbers(self, make_env, hook):
-        cls = type("Random", (PlainEnv,), {hook: lambda self: self.np_random.uniform()})
-        env = make_env(cls=cls)
-        with pytest.raises(
-            SimulationError, match="a hook drew random numbers; give a distribution"
-        ):
-            one_step(env)
-        assert 0 <= env.np_random.uniform() < 1  # outside of hooks it is there
-
     def test_unknown_names_in_hooks(self, make_env):
         class Misspelt(PlainEnv):
             def _update(self):

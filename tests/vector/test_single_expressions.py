@@ -100,7 +100,7 @@ def both(load):
         envs = load(task, **options), load(task, way="Python", **options)
         for env in envs:
             env.reset(seed=0)
-        assert [env.inside.player is None for env in envs] == [False, True]
+        assert [env.inside.compiled_step is None for env in envs] == [False, True]
         return envs
 
     return make
@@ -127,17 +127,6 @@ def test_it_is_a_batch_of_one(task, load, make_envs):
         if terminated[0] or truncated[0]:
             one.reset()
             many.step(actions)  # which begins the next episode
-
-
-def test_a_pool_steps_one_environment_only(load, make_envs):
-    env, envs = load(PENDULUM), make_envs(lambda: fmugym.load(PENDULUM), 2)
-    action = np.zeros(1, np.float32)
-    env.reset(seed=1)
-    envs.reset(seed=1)
-    with pytest.raises(TypeError, match="needs one instance"):
-        envs.inside.pool.step_one(int, None, action)
-    assert env.inside.pool.step_one(int, None, action) is None  # Python has begun the episode
-    assert len(env.step(action)) == 5
 
 
 def test_overridden_parameters(both):
@@ -224,7 +213,7 @@ class TestHooksOfClasses:
             env.reset(seed=0)
             *_, info = env.step(np.zeros(1, np.float32))
             assert info == {"seen": env.state[0]}
-            assert env.inside.player is None
+            assert env.inside.compiled_step is None
 
     def test_they_may_do_anything(self):
         seen = []
@@ -272,12 +261,12 @@ class TestHooksOfClasses:
 
 def test_the_first_reset_compiles(load):
     env = load(PENDULUM)
-    assert env.inside.player is None
+    assert env.inside.compiled_step is None
     env.reset(seed=0)
-    player = env.inside.player
-    assert player is not None
+    compiled = env.inside.compiled_step
+    assert compiled is not None
     env.reset(seed=1)
-    assert env.inside.player is player
+    assert env.inside.compiled_step is compiled
 
 
 def test_close(load):

@@ -149,7 +149,7 @@ class Limited(CART_POLE):
 
     def halve_and_stop(self):
         self.limit = self.limit / 2
-        self.step_count = 0
+        self.spec = None
 
     def name_it(self, name):
         self.name = name
@@ -183,7 +183,7 @@ def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing(m
     vector = make_envs(in_way("arrays", Limited), 3)
     vector.reset(seed=0)
     vector.step(np.zeros(3, np.int64))
-    with pytest.raises(ConfigError, match="'step_count' cannot be set"):
+    with pytest.raises(ConfigError, match="'spec' cannot be set"):
         vector.call("halve_and_stop")
     assert vector.get_attr("limit") == (2.4,) * 3
     assert vector.get_attr("marks") == ([0.0],) * 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -33,15 +34,16 @@ from fmugym.task.episode import Episode, EpisodeDraws
 from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
 from fmugym.task.native_draws import no_draws
+from fmugym.task.plain import put_back
 from fmugym.task.readings import Readings, environments_last, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import array_of, checked_actions
-from fmugym.vector.calls import MethodCalls
+from fmugym.vector.attributes import require_settable
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.engines.engine import Engine, StepResult, failed_in
+from fmugym.vector.engines.engine import Engine, StepResult, attribute, failed_in
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
@@ -56,7 +58,7 @@ from fmugym.vector.vector_saving import (
     require_fit,
     which_of,
 )
-from fmugym.vector.views import batched, column, some, take
+from fmugym.vector.views import ColumnReadings, batched, some, take
 
 __all__ = ["BatchEngine"]
 
@@ -188,7 +190,7 @@ class BatchEngine(Engine):
         """See ``Engine.single``; the prototype stands in for the environment."""
         env = self.env
         own = {name: take(row, index) for name, row in self._columns.items()}
-        with reading(env, column(Readings.of(env), index)):
+        with reading(env, ColumnReadings(env.inside.readings, index)):
             try:
                 _set_all(env, own)
                 env.inside.pool = PoolColumn(self._pool, index)
@@ -236,16 +238,20 @@ class BatchEngine(Engine):
         keywords: Mapping[str, Any],
     ) -> list[Any]:
         """See ``Engine.call``."""
-        calls, returned = MethodCalls(), []
-        for index in indices:
-            with self.single(index) as env:
-                returned.append(calls.run(env, index, name, arguments, keywords))
-        attributes = {n: self._of_all(n, values) for n, values in calls.attributes.items()}
-        variables = {n: self._with(n, values) for n, values in calls.variables.items()}
-        if attributes:
-            self._assign(attributes)
-        for variable, row in variables.items():
-            self._row(variable)[...] = row
+        before = {variable: row.copy() for variable, row in self._memory.variables.items()}
+        returned, assigned = [], defaultdict[str, dict[int, Any]](dict)
+        try:
+            for index in indices:
+                with self.single(index) as env:
+                    result, attributes = _called(env, name, arguments, keywords)
+                returned.append(result)
+                for own, value in attributes.items():
+                    assigned[own][index] = value
+            self._assign({own: self._of_all(own, values) for own, values in assigned.items()})
+        except BaseException:
+            for variable, row in before.items():
+                self._memory.variables[variable][...] = row
+            raise
         return returned
 
     def evaluate(
@@ -253,23 +259,10 @@ class BatchEngine(Engine):
     ) -> FloatArray:
         """See ``Engine.evaluate``."""
         env = self.env
-        latest = replace(Readings.of(env), action=np.moveaxis(np.asarray(actions), 0, -1))
+        latest = replace(env.inside.readings, action=np.moveaxis(np.asarray(actions), 0, -1))
         with reading(env, some(latest, indices)):
             rows = function(env)
         return np.array([np.broadcast_to(row, len(indices)) for row in rows], np.float64)
-
-    def _with(self, variable: str, values: Mapping[int, Any]) -> FloatArray:
-        """The row of an episode variable with other values for some environments."""
-        row = np.array(self._row(variable))
-        for index, value in values.items():
-            try:
-                row[..., index] = value
-            except (TypeError, ValueError):
-                raise ConfigError(
-                    f"a method has set the episode variable {variable!r} to {shown(value)}, "
-                    f"expected {row[..., index].size} numbers"
-                ) from None
-        return row
 
     def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
         """Note which environments have other constants: from options, or from before."""
@@ -331,7 +324,6 @@ class BatchEngine(Engine):
             observations: Those that the pool has made; None for those of the hook.
             mask: Where episodes have started.
         """
-        self.env.inside.in_hooks = True
         try:
             if observations is None:
                 observations = self._observe()
@@ -340,8 +332,6 @@ class BatchEngine(Engine):
         except Exception as error:
             self._blame_arrays(error)
             raise
-        finally:
-            self.env.inside.in_hooks = False
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
         wrong = not_finite(observations)
@@ -592,10 +582,10 @@ class BatchEngine(Engine):
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
-        env, read = self.env, self.env.inside.readings
+        read = self.env.inside.readings
         before = read.action, read.previous_action, read.previous_state
         read.previous_action, read.action = read.action, environments_last(actions)
-        read.previous_state, env.inside.in_hooks = read.state, True
+        read.previous_state = read.state
         try:
             self._write_inputs(self._pool.inputs, resetting)
             self._keep_variables()
@@ -603,7 +593,6 @@ class BatchEngine(Engine):
             self._blame_arrays(error)
             raise
         finally:
-            env.inside.in_hooks = False
             read.action, read.previous_action, read.previous_state = before
 
     def _write_inputs(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
@@ -652,7 +641,6 @@ class BatchEngine(Engine):
             idle = started if idle is None else idle | started
         self._idle, self._busy = idle, None if idle is None else ~idle
         observed = result.observations if inside.pool_observes else None
-        inside.in_hooks = True
         try:
             stopped = result.terminated if troubled else False
             seen, rewards, terminated, truncated = conclude(
@@ -668,8 +656,6 @@ class BatchEngine(Engine):
         except Exception as error:
             self._blame_arrays(error)
             raise
-        finally:
-            inside.in_hooks = False
         if started is not None:  # a third of the time of assignments with a mask
             running = self._busy if idle is started else ~started
             terminated &= running
@@ -794,11 +780,7 @@ class BatchEngine(Engine):
             require_started(self._pool, np.flatnonzero(started))
             self._require_finite_start(result.observations, started)
         self._require_possible_inputs(started)
-        self.env.inside.in_hooks = True
-        try:
-            self._handle_faults(result, wrong)
-        finally:
-            self.env.inside.in_hooks = False
+        self._handle_faults(result, wrong)
         self.note_ends(result.terminated, result.truncated)
         if started is not None:
             self.note_starts(started)
@@ -920,6 +902,30 @@ class _Beginning(Beginning):
     def place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
         """See ``Beginning.place``."""
         self._engine._place(values, indices)
+
+
+def _called(
+    env: FMUEnv, name: str, arguments: Sequence[Any], keywords: Mapping[str, Any]
+) -> tuple[Any, dict[str, Any]]:
+    """Call a method of one environment, for which the prototype stands in.
+
+    Returns:
+        What it returns, or the attribute if it is no method; and the attributes that it has
+        assigned, which the prototype does not keep.
+
+    Raises:
+        ConfigError: If it assigns what environments keep themselves.
+    """
+    before = dict(vars(env))
+    try:
+        value = attribute(env, name)
+        result = value(*arguments, **keywords) if callable(value) else value
+        own = {n: v for n, v in vars(env).items() if n not in before or v is not before[n]}
+        for assigned in own:
+            require_settable(assigned)
+        return result, own
+    finally:
+        put_back(env, before)
 
 
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:

@@ -15,15 +15,31 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.snapshot import Columns
-from fmugym.vector.calls import attribute
+from fmugym.vector.arguments import UnknownAttributeError
 
-__all__ = ["Engine", "StepResult", "failed_in"]
+__all__ = ["Engine", "StepResult", "attribute", "failed_in"]
 
 
 def failed_in(statuses: StatusArray) -> MaskArray:
     """Where FMUs have failed; that one has asked to stop is no failure."""
     failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
     return failed
+
+
+def attribute(env: FMUEnv, name: str) -> Any:
+    """Return an attribute of an environment, or else a variable or parameter of its episode.
+
+    Raises:
+        ConfigError: If there is none of this name (it is an ``AttributeError``, too).
+    """
+    if not hasattr(env, name):
+        for own in (env.variables, env.parameters):
+            if name in own:
+                return own[name]
+    try:
+        return getattr(env, name)
+    except AttributeError as error:
+        raise UnknownAttributeError(str(error)) from None
 
 
 class StepResult(NamedTuple):

@@ -147,7 +147,6 @@ class PerEnvEngine(Engine):
             result = self._result(self._results(idles, starts=resting is None))
         except BaseException:
             for env in self._envs:
-                env.inside.in_hooks = False
                 if self.has_moved:  # its FMU has stepped without a result
                     env.inside.ended = True
             raise
@@ -227,7 +226,6 @@ class PerEnvEngine(Engine):
         try:
             for index in running:
                 env = self._envs[index]
-                env.inside.in_hooks = True
                 befores.append((env, take_action(env, actions[index])))
         except BaseException as error:
             for env, before in befores:
@@ -293,10 +291,8 @@ class PerEnvEngine(Engine):
 
 def _concluded(env: FMUEnv, status: int, values: tuple[float, ...]) -> Result:
     """The result of a step that its FMU has done."""
-    env.inside.in_hooks = True
     env.inside.readings.step_count += 1
     result = judged(env, status, values)
-    env.inside.in_hooks = False
     if env.render_mode is not None:
         note_for_picture(env, result[1])
     return result

@@ -23,15 +23,14 @@ from fmugym.errors import FMUGymError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
 from fmugym.task.hooks import Hooks
-from fmugym.task.plain import changed, plain_attributes
+from fmugym.task.plain import changed, plain_attributes, put_back
 from fmugym.task.readings import Readings, reading
 from fmugym.task.results import as_flag, as_info, as_reward
 from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, ParameterValues
-from fmugym.vector.calls import take_back
 from fmugym.vector.codec import mapped
 from fmugym.vector.hooks import hook_results
-from fmugym.vector.views import batched, column
+from fmugym.vector.views import ColumnReadings, batched
 
 __all__ = ["CURE", "find_difference", "own_hooks"]
 
@@ -171,7 +170,7 @@ def _at_end(space: Any, action: Any, at_ends: bool) -> Any:
 
 
 def _row_of(env: FMUEnv, kind: Kind, before: Mapping[str, Any]) -> _Row:
-    now = Readings.of(env)
+    now = env.inside.readings.copy()
     parameters = MappingProxyType(ParameterValues(now.parameters))
     variables = _variables(now.variables)
     kept = replace(now, parameters=parameters, variables=variables)
@@ -197,7 +196,7 @@ def _spread_variables(rows: Sequence[_Row]) -> None:
 def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
     """States around zero, of episodes that nobody has played."""
     for index in range(_STEPS // 4):
-        episode, now = env.inside.draws.draw(rng), env.inside.own_readings
+        episode, now = env.inside.draws.draw(rng), env.inside.readings.copy()
         values = tuple(rng.normal(size=len(now.values)).tolist())
         variables = _variables(now.variables | episode.variables)
         kept = replace(
@@ -251,7 +250,7 @@ def _counts(env: FMUEnv) -> tuple[int, ...]:
     arrays = spaces.flatten_space(env.observation_space).shape or (1,)
     inside = env.inside
     lengths = {*arrays, *np.shape(inside.no_action), inside.output_count}
-    lengths |= {len(inside.start_inputs), len(inside.own_readings.values)}
+    lengths |= {len(inside.start_inputs), len(inside.readings.values)}
     for part in _boxes(env.observation_space):
         lengths |= set(part.shape)
     for value in env.variables.values():
@@ -369,7 +368,7 @@ class _Comparison:
         found: dict[int, Any] = {}
         for index, row in enumerate(self.rows):
             try:
-                found[index] = self._called(column(batch, index), self._of_one)
+                found[index] = self._called(ColumnReadings(batch, index).copy(), self._of_one)
             except _FailureError as failure:
                 if row.kind != "limit" and self._counts(row):
                     raise _DifferenceError(f"fails for one environment: {failure}") from None
@@ -409,7 +408,7 @@ class _Comparison:
         try:
             with reading(env, readings):
                 value = of(getattr(env, self.name)())
-                after = _values_in(Readings.of(env), self.name)
+                after = _values_in(env.inside.readings.copy(), self.name)
             _require_unchanged(before, after)
             _require_attributes(env, attributes, plain)
             return value
@@ -420,7 +419,7 @@ class _Comparison:
         except Exception as error:  # hooks may raise anything
             raise _FailureError(f"{type(error).__name__}: {error}") from error
         finally:
-            take_back(env, attributes)
+            put_back(env, attributes)
 
     # The results
 

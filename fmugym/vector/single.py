@@ -1,0 +1,150 @@
+"""The step of a single environment by programs of its expressions, as in a batch of one."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.env import FMUEnv
+from fmugym.expressions.program import UncompilableError
+from fmugym.pool.extension import require_refusal
+from fmugym.task.actions import as_element
+from fmugym.task.judging import Result, judged
+from fmugym.task.native_draws import no_draws
+from fmugym.task.saving import READ
+from fmugym.vector.engines.layout import Layout
+from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
+from fmugym.vector.hooks.memory import Memory
+from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.views import ColumnReadings, batched
+
+__all__ = ["ExpressionStep", "expression_step_of"]
+
+logger = logging.getLogger(__name__)
+
+_REFUSALS: Final = (TypeError, ValueError, BufferError)
+"""What the pool raises if it does not take an action."""
+
+
+def expression_step_of(env: FMUEnv) -> ExpressionStep | None:
+    """Compile the expressions of an environment, which then reads from arrays of one.
+
+    Args:
+        env: The environment, with a native pool of its own.
+
+    Returns:
+        None if they cannot be compiled, or if there is another hook.
+    """
+    formulas = formulas_of(env)
+    if formulas is None:
+        return None
+    try:
+        return ExpressionStep(env, compile_formulas(env, formulas))
+    except UncompilableError as reason:
+        text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
+        logger.info("%s. They are evaluated in Python, which is slower", text)
+        return None
+
+
+class ExpressionStep:
+    """The step of an environment whose hooks are expressions: a step of a pool of one.
+
+    Args:
+        env: The environment. It reads from the arrays of this step from now on.
+        task: The programs of its expressions.
+    """
+
+    def __init__(self, env: FMUEnv, task: TaskPrograms) -> None:
+        pool, draws = env.inside.pool, env.inside.draws
+        rows = batched(env, 1, pool.outputs, pool.inputs)
+        starts = draws.constants[:, None].copy()
+        if task.inputs.loads("parameter") or task.judgement.loads("parameter"):
+            numbers = zip(draws.parameter_names, starts, strict=True)
+            rows.parameters = {name: row for name, row in numbers if name not in draws.strings}
+        self._memory = memory = Memory(env, rows, np.zeros(1, np.bool_))
+        memory.hold(task)
+        shapes, form, self._divided = Layout(task, env, 1).of_one()
+        play = memory.prepare(
+            pool,
+            task,
+            starts,
+            (no_draws(), (), np.zeros((1, 6), np.uint64)),
+            env.inside.step_limit,
+            (tuple, form, (), shapes, (None,) * 3),
+        )
+        self._play: Any = play.step
+        self._updated = task.updated
+        self._is_discrete = isinstance(env.action_space, spaces.Discrete)
+        self._number = np.zeros(1, memory.actions[0].dtype)
+        self._take_over(env, ColumnReadings(rows, 0))
+
+    def _take_over(self, env: FMUEnv, readings: ColumnReadings) -> None:
+        """Let the environment read from the arrays what it reads now."""
+        own = env.inside.readings
+        for name in READ:
+            setattr(readings, name, getattr(own, name))
+        readings.parameters = own.parameters
+        readings.variables.update(own.variables)
+        env.inside.readings = readings
+
+    def step(self, env: FMUEnv, action: Any) -> Result:
+        """Do a step.
+
+        Raises:
+            ConfigError: If the action does not fit, or the inputs that it makes are not finite.
+            SimulationError: After a fault with ``on_fault="raise"``.
+        """
+        actions, inside = self._array_of(env, action), env.inside
+        inside.ended = True  # until the step is done: after an exception no episode goes on
+        try:
+            played = self._play(actions, False)
+        except _REFUSALS as error:
+            require_refusal(error)
+            played = self._play_element(env, action)
+        (seen, rewards, terminated, truncated, info), troubled, _, _ = played
+        if troubled:
+            return self._judge_again(env)
+        if terminated or truncated:
+            self._memory.ended[0] = False  # a reset begins the next episode, not the pool
+        else:
+            inside.ended = False
+        if self._divided is not None:
+            seen, info = self._divided(seen)
+        return seen, rewards.item(), terminated.item(), truncated.item(), info
+
+    def _array_of(self, env: FMUEnv, action: Any) -> npt.NDArray[Any]:
+        """The action of the only environment in an array."""
+        if self._is_discrete and (type(action) is int or type(action) is np.int64):
+            self._number[0] = action
+            return self._number
+        if type(action) is np.ndarray and not self._is_discrete:
+            return action[np.newaxis]
+        return as_element(env, action)[np.newaxis]
+
+    def _play_element(self, env: FMUEnv, action: Any) -> Any:
+        """Do a step with an action that the pool has refused in its own type or shape."""
+        env.inside.ended = False
+        actions = as_element(env, action)[np.newaxis]
+        env.inside.ended = True
+        return self._play(actions, False)
+
+    def _judge_again(self, env: FMUEnv) -> Result:
+        """Judge a step in Python, whose status or a number is not good, from before it on."""
+        inside, memory, read = env.inside, self._memory, env.inside.readings
+        values, read.values = read.values, memory.kept[:, 0]
+        for name in self._updated:
+            memory.variables[name][...] = memory.before[name]
+        read.done, memory.ended[0] = False, False
+        if not np.isfinite(inside.input_row).all():
+            read.step_count -= 1
+            inside.input_writer.checked(env._get_inputs(), read.action)  # it says what is wrong
+        if inside.pool_observes:
+            with np.errstate(over="ignore"):  # what is infinite then is a fault
+                inside.observation_row[:] = values[: inside.output_count]
+        result = judged(env, inside.pool.statuses.item(0), values)
+        inside.ended = result[2] or result[3]
+        return result
