@@ -232,6 +232,9 @@ class Pool:
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
+    def check_actions(self, actions: Array, /) -> None:
+        """Check actions as ``play`` does, and raise the same errors; nothing else is done."""
+
     def play_before(self, actions: Array, /) -> None:
         """Do what comes before the FMUs' part of ``play``, where the caller steps them.
 

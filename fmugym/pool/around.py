@@ -23,7 +23,7 @@ def play_around(pool: Pool, spec: PoolSpec, variables: tuple[Variable, ...], *pa
     """Prepare programs that run before and after the steps of a pool; see ``Pool.prepare_play``."""
     programs = programs_for(pool, spec)
     prepare(programs, _native.Access(form_of_listing(variables)), *parts)
-    return Play(programs.play_before, programs.play_after)
+    return Play(programs.check_actions, programs.play_before, programs.play_after)
 
 
 def programs_for(pool: Pool, spec: PoolSpec) -> _native.Pool:

@@ -44,6 +44,8 @@ class Play(NamedTuple):
     pool that steps and starts the FMUs itself has the other functions, too.
 
     Attributes:
+        check: Refuses actions as ``step`` does: by a ``TypeError``, ``ValueError`` or
+            ``BufferError``.
         before: Takes the actions, and makes the inputs.
         after: Takes the same actions, and returns what ``step`` returns.
         step: A function of actions and a flag; it does a step, and starts the episodes that have
@@ -61,6 +63,7 @@ class Play(NamedTuple):
             returns None.
     """
 
+    check: Callable[[Any], None]
     before: Callable[[Any], None]
     after: Callable[[Any], Played]
     step: Callable[[Any, bool], Played] | None = None

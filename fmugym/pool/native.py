@@ -305,7 +305,7 @@ class NativePool(AskingPool):
         pool = self._pool
         prepare(pool, self._access(variables), *parts)
         step, reset = self._starting_play
-        return Play(pool.play_before, pool.play_after, pool.play, step, reset)
+        return Play(pool.check_actions, pool.play_before, pool.play_after, pool.play, step, reset)
 
     def roll_out(self, *arrays: Any) -> int:
         """Do many steps of the prepared play in one call; episodes that end are not followed.

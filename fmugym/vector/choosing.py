@@ -16,6 +16,7 @@ from fmugym.pool.extension import has_native_pool
 from fmugym.task.hooks import Hooks
 from fmugym.task.step import ORDER
 from fmugym.vector.action_arrays import is_array_space
+from fmugym.vector.engines.arrays import ArrayEngine
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.engines.per_env import PerEnvEngine
@@ -58,7 +59,9 @@ def make_engine(
     """
     reason = _reason(prototype)
     if reason is None:
-        task = _programs(prototype) or TaskPrograms.without_programs(prototype.variables)
+        task = _programs(prototype)
+        if task is None:
+            return ArrayEngine(prototype, pool.num_instances, max_episode_steps)
         return BatchEngine(prototype, pool.num_instances, max_episode_steps, task)
     if pool.num_instances >= _MANY:
         warn_once(logger, f"the hooks of {type(prototype).__name__} are called {reason}")

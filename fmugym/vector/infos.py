@@ -152,8 +152,8 @@ def last_observations(space: spaces.Space[Any], observations: Any, mask: MaskArr
             is_tuple = isinstance(space, spaces.Tuple)
             objects[index] = (observation_of if is_tuple else getitem)(observations, index)
         return objects
-    is_float = observations.dtype.kind == "f"
-    last = np.full_like(observations, np.nan) if is_float else np.zeros_like(observations)
+    last = np.empty_like(observations)
+    last.fill(np.nan if observations.dtype.kind == "f" else 0)
     ended = mask.nonzero()[0]  # a third of the time of the mask
     last[ended] = observations[ended]
     return last

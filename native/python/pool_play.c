@@ -150,6 +150,10 @@ static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays,
     return tuple;
 }
 
+static void raise_bad_action(void) {
+    PyErr_SetString(PyExc_ValueError, "an action is out of range");
+}
+
 static bool play_turn(PyPool *self, int operation, PyTurn *t) {
     static Work *const works[OPERATIONS] = {
         [PLAY] = do_play, [BEFORE] = do_before, [AFTER] = do_after};
@@ -158,7 +162,7 @@ static bool play_turn(PyPool *self, int operation, PyTurn *t) {
         return false;
     }
     if (t->bad_action) {
-        PyErr_SetString(PyExc_ValueError, "an action is out of range");
+        raise_bad_action();
         return false;
     }
     return !is_outside(t) && report_messages(self);
@@ -265,6 +269,30 @@ static PyObject *play_by(PyObject *object, int operation, PyObject *actions, boo
                            : play_with(self, operation, playing, actions, at_ends);
     Py_DECREF(playing);
     return result;
+}
+
+/* Nothing but the check of the actions that every step begins with. */
+PyObject *py_check_actions(PyObject *object, PyObject *actions) {
+    PyPool *self = (PyPool *)object;
+    PyTurn t;
+
+    if (!is_prepared(self)) {
+        return NULL;
+    }
+    PyObject *capsule = Py_NewRef(self->playing);
+    const Playing *playing = playing_of(capsule);
+    clear_turn(playing, &t);
+    bool good = take_array_of_actions(playing, actions, &t.buffers[ACTIONS]);
+    if (good) {
+        settle_turn(self, playing, &t);
+        good = !play_has_bad_action(&t.turn, 1);
+        if (!good) {
+            raise_bad_action();
+        }
+    }
+    release_turn(playing, &t);
+    Py_DECREF(capsule);
+    return good ? Py_NewRef(Py_None) : NULL;
 }
 
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {

@@ -121,6 +121,7 @@ static PyMethodDef methods[] = {
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
     FAST("play", py_play),
+    {"check_actions", py_check_actions, METH_O, NULL},
     {"play_before", py_play_before, METH_O, NULL},
     {"play_after", py_play_after, METH_O, NULL},
     FAST("rollout", py_rollout),

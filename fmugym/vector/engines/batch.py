@@ -1,4 +1,4 @@
-"""N environments whose hooks run as programs in the pool's step, or in Python on arrays."""
+"""N environments whose hooks run as programs in the pool's step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from math import isfinite
-from traceback import walk_tb
 from types import MappingProxyType, MethodType
 from typing import Any
 
@@ -32,12 +31,10 @@ from fmugym.task.beginning import Beginning
 from fmugym.task.construction import draws_of, draws_of_reset
 from fmugym.task.episode import Episode, EpisodeDraws
 from fmugym.task.future import assumed
-from fmugym.task.hooks import Hooks
 from fmugym.task.native_draws import no_draws
 from fmugym.task.plain import put_back
-from fmugym.task.readings import Readings, environments_last, reading
+from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
-from fmugym.task.step import ORDER, conclude
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import array_of, checked_actions
 from fmugym.vector.attributes import require_settable
@@ -64,26 +61,24 @@ __all__ = ["BatchEngine"]
 
 _BOOL = np.dtype(np.bool_)
 
-_ON_ARRAYS = (*ORDER, "_goal_reward")
-"""The hooks that are called on arrays."""
-
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
 
 
 class BatchEngine(Engine):
-    """Turns a prototype into N environments; from then on, its hooks read arrays.
+    """N environments of one prototype, whose hooks read arrays; here, these are programs.
 
-    The pool does a step in one call, programs included. Where there are none of hooks, Python calls
-    each hook before or after it, once for all environments. The pool also starts episodes by
-    itself, unless there is something to do that only Python can: see ``_settle_starts``.
+    The pool does a step in one call, programs included. It also starts episodes by itself, unless
+    there is something to do that only Python can: see ``_settle_starts``.
 
     Args:
         env: The prototype, made with a pool of N instances.
         num_envs: N.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
-        task: Its programs, or those that stand for none.
+        task: Its programs.
     """
+
+    way = "expressions"
 
     def __init__(
         self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TaskPrograms
@@ -94,9 +89,6 @@ class BatchEngine(Engine):
         self._pool = env.inside.pool
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
-        self._idle: MaskArray | None = None
-        self._busy: MaskArray | None = None
-        self._all = np.ones(num_envs, np.bool_)
         self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
         self._variable_starts: dict[str, FloatArray] = {}
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
@@ -127,8 +119,7 @@ class BatchEngine(Engine):
         env, memory = self.env, self._memory
         draws, native = env.inside.draws, env.inside.draws.native
         drawn = () if native is None else draws.drawn
-        self._task, self._calls_hooks = task, not task.is_compiled
-        self.way = "expressions" if task.is_compiled else "arrays"
+        self._task = task
         memory.parameters = self._parameters
         memory.hold(task)
         self._layout = layout = Layout(task, env, self._n)
@@ -145,7 +136,6 @@ class BatchEngine(Engine):
         has_all_starts = native is not None and fit
         is_free = env.inside.warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
-        self._are_hooks_tried = False
         self._settle_starts()
 
     def _settle_starts(self) -> None:
@@ -156,7 +146,7 @@ class BatchEngine(Engine):
         """
         is_usual = not self._any_foreign and not self._variable_starts
         self._pool_starts = self._may_start and is_usual
-        self._starts_at_ends = self._pool_starts and not self._calls_hooks
+        self._starts_at_ends = self._pool_starts
 
     def set_variable(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_variable``."""
@@ -303,19 +293,19 @@ class BatchEngine(Engine):
             raise
         if done is None:
             return None
-        result, troubled, self.any_ended = done
-        if not troubled and not self._calls_hooks:
-            return result
-        observations, infos = result
-        mask, self.has_moved = infos["_drawn"], True
+        (observations, infos), troubled, self.any_ended = done
         if troubled:
-            require_started(self._pool, np.flatnonzero(mask))
-        if self._calls_hooks:
-            made = observations if self.env.inside.pool_observes else None
-            observations, more = self._seen_at_start(made, mask)
-            return observations, more | infos
-        self._require_finite_start(observations, mask)
-        return result
+            self.has_moved = True
+            require_started(self._pool, np.flatnonzero(infos["_drawn"]))
+        return self._begun(observations, infos, troubled)
+
+    def _begun(
+        self, observations: Any, infos: dict[str, Any], troubled: int
+    ) -> tuple[Any, dict[str, Any]]:
+        """The result of a reset by the pool; impossible first observations are refused."""
+        if troubled:
+            self._require_finite_start(observations, infos["_drawn"])
+        return observations, infos
 
     def _seen_at_start(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
         """The observations and infos where episodes have started; refuse impossible starts.
@@ -324,14 +314,10 @@ class BatchEngine(Engine):
             observations: Those that the pool has made; None for those of the hook.
             mask: Where episodes have started.
         """
-        try:
-            if observations is None:
-                observations = self._observe()
-            self._require_finite_start(observations, mask)
-            return observations, self._infos(mask)
-        except Exception as error:
-            self._blame_arrays(error)
-            raise
+        if observations is None:
+            observations = self._observe()
+        self._require_finite_start(observations, mask)
+        return observations, self._infos(mask)
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
         wrong = not_finite(observations)
@@ -479,55 +465,58 @@ class BatchEngine(Engine):
         """See ``Engine.step``."""
         if resting is not None:
             return self._step_around(actions, resting)
-        in_python = resetting is not None and not self._pool_starts
-        if self._calls_hooks or in_python:
-            actions = self._checked_before(actions, resetting)
+        if self.offsets is not None or (resetting is not None and not self._pool_starts):
+            taken = self._take_actions(actions, resetting)
+            return self._completed(self._step_pool(taken, resetting), resetting)
+        return self._completed(self._play_step(actions, resetting), resetting)
+
+    def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
+        """Let the pool do the whole step, if it can."""
         at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
+        if step is None:
+            return self._step_pool(self._take_actions(actions, resetting), resetting)
         self.has_moved = True  # unless the call refuses its arguments
-        played: Played
         try:
-            if step is None or in_python or self.offsets is not None:
-                played = self._step_pool(actions, resetting)
-            else:
-                played = step(actions, at_ends)
+            return step(actions, at_ends)
         except _REFUSALS as error:
-            return self.step(self._converted(actions, error), resetting)
-        result: StepResult
-        result, troubled, self.any_ended, started = played
-        if troubled or self._calls_hooks:
-            return self._completed(result, troubled, started)
-        return result
+            return self._play_step(self._converted(actions, error), resetting)
+
+    def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, before anything is drawn or stepped.
+
+        Args:
+            actions: Of all environments.
+            idle: Which environments will not step, shape (N,); None if all will.
+        """
+        self.has_moved = False
+        try:
+            self._play.check(actions)
+        except _REFUSALS as error:
+            actions = self._converted(actions, error)
+            self._play.check(actions)
+        taken: npt.NDArray[Any] = actions
+        return taken
 
     def _step_around(self, actions: Any, resting: MaskArray) -> StepResult:
         """Step the environments that do not rest; what is not stepped counts as just started."""
-        play, checked = self._play, self._checked_before(actions, resting)
+        play, taken = self._play, self._take_actions(actions, resting)
         self.has_moved = True
         self.ended[:] = resting
-        play.before(checked)
+        play.before(taken)
         self._pool.step(None, resting)
         self._pool.statuses[resting] = 0  # a fault was told when it came
         self.add_offsets(self._pool, resting)
-        result: StepResult
-        result, troubled, *_ = play.after(checked)
-        if troubled or self._calls_hooks:
-            result = self._completed(result, troubled, resting)
+        result = self._completed(play.after(taken), resting)
         self.ended |= resting
         self.any_ended = True
         return result
-
-    def _checked_before(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
-        """Check actions before anything is drawn, and call ``_get_inputs`` unless programs do."""
-        self.has_moved = False
-        checked = self._flat(actions)
-        if self._calls_hooks:
-            self._call_get_inputs(checked, resetting)
-        return checked
 
     @passes_refusals
     def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
         """Start the episodes in the mask, and let the FMUs of the other environments step."""
         play, draws = self._play, self.env.inside.draws
+        self.has_moved = True
         if starting is None:
             play.before(actions)
             self._pool.step()
@@ -552,6 +541,22 @@ class BatchEngine(Engine):
             raise error
         return converted
 
+    def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
+        """The result of a step of the pool, in which faults are settled."""
+        result: StepResult
+        result, troubled, self.any_ended, started = played
+        if troubled:
+            self._settle(result, troubled, idle if started is None else started)
+        return result
+
+    def _settle(self, result: StepResult, troubled: int, started: MaskArray | None) -> None:
+        """Find numbers that are not finite, and handle them and failures."""
+        rewards = not_finite(result.rewards)
+        is_told = self.env.inside.pool_observes and not troubled
+        observations = None if is_told else not_finite(result.observations)
+        if troubled or rewards is not None or observations is not None:
+            self._mend(result, started, (rewards, observations))
+
     def _flat(self, actions: Any) -> npt.NDArray[Any]:
         """The actions as the pool takes them, environments first.
 
@@ -567,7 +572,7 @@ class BatchEngine(Engine):
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
-        if self._calls_hooks or not self._pool.rolls_out:
+        if not self._pool.rolls_out:
             return None
         shape = len(actions), self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
@@ -577,23 +582,6 @@ class BatchEngine(Engine):
         if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
             return None
         return observations, *judged, costs_in(infos, shape)
-
-    # Hooks on arrays.
-
-    def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
-        """Call this hook on arrays, before the pool takes over the actions."""
-        read = self.env.inside.readings
-        before = read.action, read.previous_action, read.previous_state
-        read.previous_action, read.action = read.action, environments_last(actions)
-        read.previous_state = read.state
-        try:
-            self._write_inputs(self._pool.inputs, resetting)
-            self._keep_variables()
-        except Exception as error:
-            self._blame_arrays(error)
-            raise
-        finally:
-            read.action, read.previous_action, read.previous_state = before
 
     def _write_inputs(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
         hook_results.write_inputs(self.env._get_inputs(), inputs)
@@ -617,135 +605,6 @@ class BatchEngine(Engine):
                 raise ConfigError(
                     f"an input of environment {index} is not finite: {inputs[:, index]}"
                 )
-
-    def _completed(
-        self, result: StepResult, troubled: int, started: MaskArray | None
-    ) -> StepResult:
-        """Call the hooks if programs have not done their work, and handle faults."""
-        if self._calls_hooks:
-            result = self._concluded(result, troubled, started)
-        rewards = not_finite(result.rewards)
-        is_told = self.env.inside.pool_observes and not troubled
-        observations = None if is_told else not_finite(result.observations)
-        if troubled or rewards is not None or observations is not None:
-            self._mend(result, started, (rewards, observations))
-        return result
-
-    def _concluded(
-        self, result: StepResult, troubled: int, started: MaskArray | None
-    ) -> StepResult:
-        """Call the hooks that follow the FMUs' step."""
-        env, inside = self.env, self.env.inside
-        idle = failed_in(self._pool.statuses) if troubled else None
-        if started is not None:
-            idle = started if idle is None else idle | started
-        self._idle, self._busy = idle, None if idle is None else ~idle
-        observed = result.observations if inside.pool_observes else None
-        try:
-            stopped = result.terminated if troubled else False
-            seen, rewards, terminated, truncated = conclude(
-                env, self, stopped, result.truncated, observed
-            )
-            if observed is None:
-                seen = hook_results.observations(seen, env.observation_space, self._n)
-            infos = result.infos
-            if inside.has_info:
-                infos = self._infos(self._all) | infos
-            self._keep_variables()
-            self._are_hooks_tried = True
-        except Exception as error:
-            self._blame_arrays(error)
-            raise
-        if started is not None:  # a third of the time of assignments with a mask
-            running = self._busy if idle is started else ~started
-            terminated &= running
-            truncated &= running
-            np.copyto(rewards, 0.0, where=started)
-        self._memory.keep_done(terminated)
-        self.note_ends(terminated, truncated)
-        return StepResult(seen, rewards, terminated, truncated, infos)
-
-    def _blame_arrays(self, error: Exception) -> None:
-        """Say which hook has not worked on arrays, until all have done so in a first step.
-
-        Raises:
-            ConfigError: If a hook has raised the error, or returned what cannot be used.
-        """
-        codes = [getattr(getattr(self.env, name), "__code__", None) for name in _ON_ARRAYS]
-        frames = [frame.f_code for frame, _ in walk_tb(error.__traceback__)]
-        named = zip(_ON_ARRAYS, codes, strict=True)
-        hook = next((name for name, code in named if code in frames), None)
-        if isinstance(error, ConfigError):
-            hook = next((name for name in _ON_ARRAYS if str(error).startswith(f"{name} ")), None)
-        if hook is None or self._are_hooks_tried or isinstance(error, SimulationError):
-            return
-        what = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-        raise ConfigError(
-            f"{hook} of {type(self.env).__name__}, whose hooks are said to be vectorized, does "
-            f"not work on the arrays of {self._n} environments: {what}. "
-            "fmugym.testing.check_hooks shows what is wrong"
-        ) from error
-
-    # The form of what hooks return.
-
-    flag_type: type | None = None
-    reward_type: type | None = None
-
-    def flags(self, hook: str, value: Any) -> MaskArray:
-        """See ``Form.flags``; nothing is done where the FMU has not stepped."""
-        found = hook_results.flags(hook, value, self._n)
-        if self._busy is not None and hook == "_is_done":
-            found &= self._busy
-        return found
-
-    def rewards(self, value: Any) -> FloatArray:
-        """See ``Form.rewards``."""
-        return hook_results.rewards(value, self._n)
-
-    def update(self, env: Hooks) -> None:
-        """Call the hook, but keep the variables of environments that did not step."""
-        env._update()
-        self._keep_variables()
-        if self._idle is not None and self._idle.any():
-            self._restore_variables(self._idle)
-
-    def _keep_variables(self) -> None:
-        """Copy what hooks have assigned to the arrays that the pool keeps, or make others."""
-        variables, held = self.env.variables, self._memory.variables
-        assigned = [name for name, row in held.items() if variables[name] is not row]
-        if not assigned:
-            return
-        others: dict[str, np.dtype[Any]] = {}
-        values = [self._value_of(name, variables[name], len(assigned)) for name in assigned]
-        for name, value in zip(assigned, values, strict=True):
-            row = held[name]
-            if value.dtype == row.dtype and value.shape == row.shape:
-                np.copyto(row, value)
-                dict.__setitem__(variables, name, row)  # it needs no check
-            else:
-                variables[name], others[name] = value, value.dtype
-        if others:
-            before = dict(self._memory.before)
-            self._prepare(replace(self._task, variables={**self._task.variables, **others}))
-            self._memory.take_back(before)
-
-    def _value_of(self, name: str, value: Any, count: int) -> npt.NDArray[Any]:
-        """A value of a variable in the type that it is kept in.
-
-        If more than one are assigned, it is an array that the others do not write.
-        """
-        row = self._memory.variables[name]
-        if type(value) is np.ndarray and value.dtype == row.dtype and value.shape == row.shape:
-            is_apart = count == 1 or (value.base is None and not self._holds(value))
-            return value if is_apart else value.copy()
-        array = hook_results.variable(name, value, self._n)
-        if array.dtype == np.float64:
-            return array
-        dtype = hook_results.type_of_variable(self.env.inside.draws, name, array.dtype)
-        return array.astype(dtype, copy=False)
-
-    def _holds(self, value: npt.NDArray[Any]) -> bool:
-        return any(value is row for row in self._memory.variables.values())
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._memory.before.items():
@@ -859,7 +718,7 @@ class BatchEngine(Engine):
             )
         copy_rows(again, result.observations, mask)
         if self.env.inside.has_info:
-            infos = self._infos(self._all)
+            infos = self._infos(np.ones(self._n, np.bool_))
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 
 

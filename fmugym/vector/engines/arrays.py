@@ -1,0 +1,231 @@
+"""N environments whose hooks are called once a step, on arrays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from traceback import walk_tb
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.pool.base import FloatArray, MaskArray, Played
+from fmugym.task.hooks import Hooks
+from fmugym.task.readings import environments_last
+from fmugym.task.step import ORDER, conclude
+from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.engines.engine import StepResult, failed_in
+from fmugym.vector.hooks import hook_results
+from fmugym.vector.hooks.task_programs import TaskPrograms
+
+__all__ = ["ArrayEngine"]
+
+_ON_ARRAYS: Final = (*ORDER, "_goal_reward")
+"""The hooks that are called on arrays."""
+
+
+class ArrayEngine(BatchEngine):
+    """A batch whose hooks are called on arrays, before the step of the FMUs and after it.
+
+    Args:
+        env, num_envs, max_episode_steps: See ``BatchEngine``.
+    """
+
+    way = "arrays"
+
+    def __init__(self, env: FMUEnv, num_envs: int, max_episode_steps: int | None) -> None:
+        self._idle: MaskArray | None = None
+        self._busy: MaskArray | None = None
+        self._all = np.ones(num_envs, np.bool_)
+        super().__init__(
+            env, num_envs, max_episode_steps, TaskPrograms.without_programs(env.variables)
+        )
+
+    def _prepare(self, task: TaskPrograms) -> None:
+        super()._prepare(task)
+        self._are_hooks_tried = False
+
+    def _settle_starts(self) -> None:
+        """See ``BatchEngine._settle_starts``; hooks tell which episodes end."""
+        super()._settle_starts()
+        self._starts_at_ends = False
+
+    # The beginning of episodes.
+
+    def _begun(
+        self, observations: Any, infos: dict[str, Any], troubled: int
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``BatchEngine._begun``."""
+        self.has_moved = True
+        made = observations if self.env.inside.pool_observes else None
+        observations, more = self._seen_at_start(made, infos["_drawn"])
+        return observations, more | infos
+
+    def _seen_at_start(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
+        """See ``BatchEngine._seen_at_start``."""
+        try:
+            return super()._seen_at_start(observations, mask)
+        except Exception as error:
+            self._blame_arrays(error)
+            raise
+
+    def roll_out(self, actions: npt.NDArray[Any]) -> None:
+        """See ``Engine.roll_out``: hooks take one step at a time."""
+
+    # A step.
+
+    def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
+        """See ``BatchEngine._play_step``."""
+        taken, step = self._take_actions(actions, resetting), self._play.step
+        if step is None:
+            return self._step_pool(taken, resetting)
+        self.has_moved = True
+        return step(taken, False)
+
+    def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
+        """See ``BatchEngine._take_actions``; the hook makes the inputs.
+
+        If the hook fails, nothing has changed.
+        """
+        taken = np.array(super()._take_actions(actions, idle))  # of which a hook may keep a part
+        read = self.env.inside.readings
+        before = read.action, read.previous_action, read.previous_state
+        read.previous_action, read.action = read.action, environments_last(taken)
+        read.previous_state = read.state
+        try:
+            self._write_inputs(self._pool.inputs, idle)
+            self._keep_variables()
+            return taken
+        except Exception as error:
+            self._blame_arrays(error)
+            raise
+        finally:
+            read.action, read.previous_action, read.previous_state = before
+
+    def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
+        """See ``BatchEngine._completed``."""
+        result, troubled, _, started = played
+        started = idle if started is None else started
+        result = self._concluded(result, troubled, started)
+        self._settle(result, troubled, started)
+        return result
+
+    def _concluded(
+        self, result: StepResult, troubled: int, started: MaskArray | None
+    ) -> StepResult:
+        """Call the hooks that follow the FMUs' step."""
+        env, inside = self.env, self.env.inside
+        idle = failed_in(self._pool.statuses) if troubled else None
+        if started is not None:
+            idle = started if idle is None else idle | started
+        self._idle, self._busy = idle, None if idle is None else ~idle
+        observed = result.observations if inside.pool_observes else None
+        try:
+            stopped = result.terminated if troubled else False
+            seen, rewards, terminated, truncated = conclude(
+                env, self, stopped, result.truncated, observed
+            )
+            if observed is None:
+                seen = hook_results.observations(seen, env.observation_space, self._n)
+            infos = result.infos
+            if inside.has_info:
+                infos = self._infos(self._all) | infos
+            self._keep_variables()
+            self._are_hooks_tried = True
+        except Exception as error:
+            self._blame_arrays(error)
+            raise
+        if started is not None:  # a third of the time of assignments with a mask
+            running = self._busy if idle is started else ~started
+            terminated &= running
+            truncated &= running
+            np.copyto(rewards, 0.0, where=started)
+        self._memory.keep_done(terminated)
+        self.note_ends(terminated, truncated)
+        return StepResult(seen, rewards, terminated, truncated, infos)
+
+    def _blame_arrays(self, error: Exception) -> None:
+        """Say which hook has not worked on arrays, until all have done so in a first step.
+
+        Raises:
+            ConfigError: If a hook has raised the error, or returned what cannot be used.
+        """
+        codes = [getattr(getattr(self.env, name), "__code__", None) for name in _ON_ARRAYS]
+        frames = [frame.f_code for frame, _ in walk_tb(error.__traceback__)]
+        named = zip(_ON_ARRAYS, codes, strict=True)
+        hook = next((name for name, code in named if code in frames), None)
+        if isinstance(error, ConfigError):
+            hook = next((name for name in _ON_ARRAYS if str(error).startswith(f"{name} ")), None)
+        if hook is None or self._are_hooks_tried or isinstance(error, SimulationError):
+            return
+        what = error if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(
+            f"{hook} of {type(self.env).__name__}, whose hooks are said to be vectorized, does "
+            f"not work on the arrays of {self._n} environments: {what}. "
+            "fmugym.testing.check_hooks shows what is wrong"
+        ) from error
+
+    # The form of what hooks return.
+
+    flag_type: type | None = None
+    reward_type: type | None = None
+
+    def flags(self, hook: str, value: Any) -> MaskArray:
+        """See ``Form.flags``; nothing is done where the FMU has not stepped."""
+        found = hook_results.flags(hook, value, self._n)
+        if self._busy is not None and hook == "_is_done":
+            found &= self._busy
+        return found
+
+    def rewards(self, value: Any) -> FloatArray:
+        """See ``Form.rewards``."""
+        return hook_results.rewards(value, self._n)
+
+    def update(self, env: Hooks) -> None:
+        """Call the hook, but keep the variables of environments that did not step."""
+        env._update()
+        self._keep_variables()
+        if self._idle is not None and self._idle.any():
+            self._restore_variables(self._idle)
+
+    def _keep_variables(self) -> None:
+        """Copy what hooks have assigned to the arrays that the pool keeps, or make others."""
+        variables, held = self.env.variables, self._memory.variables
+        if not held:
+            return
+        assigned = [name for name, row in held.items() if variables[name] is not row]
+        if not assigned:
+            return
+        others: dict[str, np.dtype[Any]] = {}
+        values = [self._value_of(name, variables[name], len(assigned)) for name in assigned]
+        for name, value in zip(assigned, values, strict=True):
+            row = held[name]
+            if value.dtype == row.dtype and value.shape == row.shape:
+                np.copyto(row, value)
+                dict.__setitem__(variables, name, row)  # it needs no check
+            else:
+                variables[name], others[name] = value, value.dtype
+        if others:
+            before = dict(self._memory.before)
+            self._prepare(replace(self._task, variables={**self._task.variables, **others}))
+            self._memory.take_back(before)
+
+    def _value_of(self, name: str, value: Any, count: int) -> npt.NDArray[Any]:
+        """A value of a variable in the type that it is kept in.
+
+        If more than one are assigned, it is an array that the others do not write.
+        """
+        row = self._memory.variables[name]
+        if type(value) is np.ndarray and value.dtype == row.dtype and value.shape == row.shape:
+            is_apart = count == 1 or (value.base is None and not self._holds(value))
+            return value if is_apart else value.copy()
+        array = hook_results.variable(name, value, self._n)
+        if array.dtype == np.float64:
+            return array
+        dtype = hook_results.type_of_variable(self.env.inside.draws, name, array.dtype)
+        return array.astype(dtype, copy=False)
+
+    def _holds(self, value: npt.NDArray[Any]) -> bool:
+        return any(value is row for row in self._memory.variables.values())
