@@ -19,7 +19,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial, reduce
+from functools import cached_property, partial, reduce
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -130,10 +130,10 @@ class Expression:
                 node.id = name_of(ast.get_source_segment(text, node) or node.id)
         return replace(self, tree=tree)
 
-    @property
-    def names(self) -> set[str]:
+    @cached_property
+    def names(self) -> frozenset[str]:
         """The names that it reads."""
-        return set(_names_in(self.text, self.tree))
+        return frozenset(_names_in(self.text, self.tree))
 
     @property
     def previous_names(self) -> set[str]:

