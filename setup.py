@@ -7,7 +7,6 @@ import sys
 import sysconfig
 from pathlib import Path
 
-import numpy as np
 from setuptools import Extension, setup
 
 from build_backend import OPTIONS, BuildExtension, has_headers
@@ -24,7 +23,7 @@ native = Extension(
         if path.name != "main.c"  # of the worker program, which fmugym.wine builds
     ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
-    include_dirs=["native", np.get_include()],
+    include_dirs=["native"],
     **OPTIONS,
 )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from math import isfinite
 from operator import getitem
 from typing import Any
@@ -15,7 +14,7 @@ from gymnasium import spaces
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.readings import environments_first
-from fmugym.task.values import UNFILLED, LateDict
+from fmugym.task.values import LateDict
 from fmugym.vector.codec import coded, mapped, within
 
 __all__ = [
@@ -23,7 +22,6 @@ __all__ = [
     "drawn_info",
     "final_infos",
     "last_observations",
-    "late_info",
     "merged",
     "not_finite",
     "observation_of",
@@ -32,21 +30,14 @@ __all__ = [
 
 
 def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    """The info of a reset.
+    """The info of episodes that start.
 
     Args:
         draws: What the environments in the mask have drawn from.
-        drawn: What they have drawn, shape (draws, M).
-        mask: The environments that were reset. No caller changes it.
+        drawn: What they have drawn, shape (draws, N); that of others is not read.
+        mask: The environments. No caller changes it.
     """
-    of_all = np.zeros((len(drawn), len(mask)))
-    of_all[:, mask] = drawn
-    return {"drawn": LateDict.of(_told, draws, of_all, mask), "_drawn": mask}  # rarely read
-
-
-def late_info(draws: EpisodeDraws) -> tuple[Any, ...]:
-    """How the C extension makes ``"drawn"`` of ``drawn_info`` from drawn values and a mask."""
-    return LateDict, UNFILLED, partial(_told, draws)
+    return {"drawn": LateDict.of(_told, draws, drawn, mask), "_drawn": mask}  # rarely read
 
 
 def _told(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
