@@ -165,7 +165,8 @@ STARTS = FLAGS, DRAWN, SEEN
 
 @pytest.fixture
 def play():
-    envs = make(CartPoleEnv)
+    envs = FMUVectorEnv(CartPoleEnv, NUM_ENVS)
+    envs.reset(seed=0)
     yield envs.inside.engine._play
     envs.close()
 
