@@ -383,6 +383,13 @@ class FMUEnv(Constructed):
         return expressions or tuple(v.name for v in self.inside.interface.outputs)
 
     @property
+    def action_names(self) -> tuple[str, ...] | None:
+        """The names of the action's elements; None if a hook of the class makes inputs of it."""
+        if type(self)._get_inputs is not FMUEnv._get_inputs:
+            return None
+        return tuple(variable.name for variable in self.inside.interface.chosen_inputs)
+
+    @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
         """The goal reward in the form that hindsight replay calls; see ``_goal_reward``.
 

@@ -24,6 +24,7 @@ SLOW_MODULES = {
     "test_examples_planners",
     "test_examples_references",
     "test_examples_system",
+    "test_examples_two_zones",
     "test_export",
     "test_export_fmu",
     "test_export_onnx",

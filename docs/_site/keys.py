@@ -37,6 +37,7 @@ TABLES = {
     "reward": task_format.REWARD.keys,
     "scenario": task_format.SCENARIO.keys,
     "season": task_format.SEASON.keys,
+    "signal": task_format.SIGNAL.keys,
     "setpoint": task_format.SETPOINT.keys,
     "system": task_format.SYSTEM_OF_TASK.keys,
     "tag": task_format.TAG.keys,

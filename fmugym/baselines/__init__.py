@@ -15,6 +15,7 @@ from fmugym.baselines.feedback import LQR, PID, Hysteresis
 from fmugym.baselines.feedforward import Constant, Random, Schedule
 from fmugym.baselines.mpc import MPC
 from fmugym.baselines.parsing import controller_of
+from fmugym.baselines.table import ControllerTable, Signal
 from fmugym.baselines.tuning import Tuning, tune
 
 __all__ = [
@@ -23,9 +24,11 @@ __all__ = [
     "PID",
     "Constant",
     "Controller",
+    "ControllerTable",
     "Hysteresis",
     "Random",
     "Schedule",
+    "Signal",
     "Tuning",
     "controller_of",
     "tune",

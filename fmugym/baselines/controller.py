@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
-from fmugym.baselines.measuring import Formula, formula_of, of_rows
+from fmugym.baselines.measuring import Formula, formula_of, of_columns
 from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.expressions.value import Value, where
@@ -46,6 +46,7 @@ class Controller(KnownArguments, ABC):
             do not say otherwise.
         space: The action space of one environment.
         names: The names of the observation's elements.
+        action_names: The names of the action's elements; None if a hook makes something of them.
         time_step: The length of a step in s.
         count: The number of environments.
     """
@@ -55,8 +56,10 @@ class Controller(KnownArguments, ABC):
 
     space: spaces.Space[Any]
     names: tuple[str, ...]
+    action_names: tuple[str, ...] | None
     time_step: float
     count: int
+    _is_vector: bool = True
 
     def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
         """Prepare for an environment and forget all episodes.
@@ -76,10 +79,29 @@ class Controller(KnownArguments, ABC):
         if self.is_physical:
             require_physical(env)
         self._is_vector = hasattr(env, "single_action_space")
-        self.count = env.num_envs if self._is_vector else 1
-        self.space = env.single_action_space if self._is_vector else env.action_space
-        self.time_step = attribute_of(env, "config").time_step
-        self.names = self._names_of(env) if names is None else tuple(names)
+        return self.attach(
+            env.single_action_space if self._is_vector else env.action_space,
+            self._names_of(env) if names is None else tuple(names),
+            attribute_of(env, "action_names"),
+            attribute_of(env, "config").time_step,
+            env.num_envs if self._is_vector else 1,
+        )
+
+    def attach(
+        self,
+        space: spaces.Space[Any],
+        names: tuple[str, ...],
+        action_names: tuple[str, ...] | None,
+        time_step: float,
+        count: int,
+    ) -> Self:
+        """Prepare for actions of a space, as the attributes say, and forget all episodes.
+
+        Raises:
+            ConfigError: If something that the controller needs is not there.
+        """
+        self.space, self.names, self.action_names = space, names, action_names
+        self.time_step, self.count = time_step, count
         self._signals = {}
         self._prepare()
         self.reset()
@@ -167,20 +189,17 @@ class Controller(KnownArguments, ABC):
 
     # Shared by controllers.
 
-    def _column(self, rows: FloatArray, signal: Signal) -> FloatArray:
-        """The values of a signal, shape (N,)."""
-        if isinstance(signal, str):
-            _, evaluate = self._signals[signal]
-            signals: FloatArray = evaluate(rows)
-            return signals
-        return np.full(len(rows), signal)
+    def _value(self, seen: Sequence[Any], signal: Signal) -> Any:
+        """The value of a signal.
 
-    def _formula(self, observation: Sequence[Value], signal: Signal) -> Value:
-        """The value of a signal."""
-        if isinstance(signal, str):
-            formula, _ = self._signals[signal]
-            return formula(observation)
-        return observation[0].beside(signal)
+        Args:
+            seen: The elements of the observation: formulas, or arrays of shape (N,).
+            signal: A signal that is checked, or a constant.
+        """
+        if not isinstance(signal, str):
+            return signal
+        formula, of_columns = self._signals[signal]
+        return formula(seen) if isinstance(seen[0], Value) else of_columns(seen)
 
     def _check_signal(self, what: str, signal: Signal) -> None:
         """Check a signal; one that is no name may be an expression."""
@@ -188,12 +207,12 @@ class Controller(KnownArguments, ABC):
             self._check_size(what, check_numbers(what, signal))
         elif signal.isidentifier() or self._is_name(signal):
             self._check_name(what, signal)
-            place = self._place_of(signal)
-            self._signals[signal] = itemgetter(place), itemgetter((slice(None), place))
+            element = itemgetter(self._place_of(signal))
+            self._signals[signal] = element, element
         else:
             try:
                 formula = formula_of(signal, self.names)
-                self._signals[signal] = formula, of_rows(formula, len(self.names))
+                self._signals[signal] = formula, of_columns(formula, len(self.names))
             except ConfigError as error:
                 raise ConfigError(f"{what}: {error}") from None
 
@@ -237,6 +256,8 @@ class Controller(KnownArguments, ABC):
         values = values.reshape(len(values), *space.shape or ())
         if isinstance(space, spaces.Box):
             values = limited(values, space.low, space.high)
+        elif isinstance(space, spaces.MultiDiscrete):
+            values = limited(np.rint(values), space.start, space.start + space.nvec - 1)
         return values.astype(space.dtype)
 
     def action_of(self, values: Sequence[Value]) -> list[Value]:
@@ -251,6 +272,10 @@ class Controller(KnownArguments, ABC):
         elif isinstance(space, spaces.Box):
             limits = zip(values, space.low.flat, space.high.flat, strict=True)
             values = [limited(one, low, high) for one, low, high in limits]
+        elif isinstance(space, spaces.MultiDiscrete):
+            ends = space.start.ravel(), (space.start + space.nvec - 1).ravel()
+            limits = zip(values, *(end.tolist() for end in ends), strict=True)
+            values = [limited(np.rint(one), low, high) for one, low, high in limits]
         return [one.cast(space.dtype) for one in values]
 
     def _shape(self) -> str:

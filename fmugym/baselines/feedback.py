@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from functools import reduce
 from operator import add
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fmugym.baselines.controller import (
     Controller,
@@ -20,63 +18,14 @@ from fmugym.baselines.controller import (
     either,
     limited,
 )
+from fmugym.baselines.law import Decided, Law
 from fmugym.errors import ConfigError
 from fmugym.expressions.value import Value
 from fmugym.extras import imported
 from fmugym.linearization import LinearModel
 from fmugym.linearization.trajectories import discrete
 
-__all__ = ["LQR", "PID", "Hysteresis", "Law"]
-
-
-class Law(Controller):
-    """A controller of one value, whose next action follows from a few numbers.
-
-    Attributes:
-        of: The name of what is measured.
-        setpoint: What it shall be: a name or a constant.
-        starts: The numbers that it remembers, at the beginning of an episode.
-    """
-
-    of: str
-    setpoint: Signal
-    starts: tuple[Numbers, ...]
-
-    @abstractmethod
-    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
-        """Compute the action, before it is limited: of arrays element by element, or of formulas.
-
-        Args:
-            value: What is measured.
-            setpoint: What it shall be.
-            state: What the controller remembers, in the order of ``starts``.
-
-        Returns:
-            The action, and what the controller remembers then.
-        """
-
-    def decision(
-        self, observation: Sequence[Value], memory: Sequence[Value] = ()
-    ) -> tuple[Sequence[Value], Sequence[Value]]:
-        """See ``Controller.decision``."""
-        value, setpoint = (self._formula(observation, one) for one in (self.of, self.setpoint))
-        action, state = self.law(value, setpoint, memory)
-        return [action], state
-
-    def _prepare(self) -> None:
-        self._check_signal("of", self.of)
-        self._check_signal("setpoint", self.setpoint)
-        self._state = tuple(np.full(self.count, start) for start in self.starts)
-
-    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
-        pairs = zip(self.starts, self._state, strict=True)
-        self._state = tuple(np.where(mask, start, now) for start, now in pairs)
-
-    def _decide(self, rows: FloatArray) -> FloatArray:
-        action: FloatArray
-        value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
-        action, self._state = self.law(value, setpoint, self._state)
-        return action
+__all__ = ["LQR", "PID", "Hysteresis"]
 
 
 class Hysteresis(Law):
@@ -92,6 +41,8 @@ class Hysteresis(Law):
         above: The action above the band.
     """
 
+    signals = ("of", "setpoint")
+
     def __init__(
         self, of: str, setpoint: Signal, band: Numbers, below: Numbers = 1.0, above: Numbers = 0.0
     ) -> None:
@@ -106,12 +57,12 @@ class Hysteresis(Law):
             self._check_size(name, getattr(self, name))
         super()._prepare()
 
-    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
         """See ``Law.law``; the controller remembers its action."""
-        error = value - setpoint
+        error = self._value(seen, self.of) - self._value(seen, self.setpoint)
         kept = either(error > self.band, self.above, state[0])
         action = either(error < -self.band, self.below, kept)
-        return action, (action,)
+        return [action], (action,)
 
 
 class PID(Law):
@@ -137,6 +88,8 @@ class PID(Law):
         offset: The action where the error is zero.
     """
 
+    signals = ("of", "setpoint")
+
     def __init__(
         self,
         of: str,
@@ -159,19 +112,35 @@ class PID(Law):
             self._check_size(name, getattr(self, name))
         super()._prepare()
 
-    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+    @property
+    def integrates(self) -> bool:
+        """See ``Law.integrates``."""
+        return self.ti is not None
+
+    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
         """See ``Law.law``; the controller remembers the integral and the last value."""
-        integral, last = state
-        error = setpoint - value
+        value, rest, growth = self._parts(seen, state)
+        if growth is None:
+            return [rest], (state[0], value)
+        wanted = rest + state[0] + growth
+        beyond = wanted - limited(wanted, self._low, self._high)
+        stays = beyond * growth > 0
+        stays = stays if holds is False else stays | holds
+        integral = either(stays, state[0], state[0] + growth)
+        return [rest + integral], (integral, value)
+
+    def wanted(self, seen: Sequence[Any], state: Sequence[Any]) -> Any:
+        """See ``Law.wanted``."""
+        _, rest, growth = self._parts(seen, state)
+        return rest if growth is None else rest + state[0] + growth
+
+    def _parts(self, seen: Sequence[Any], state: Sequence[Any]) -> tuple[Any, Any, Any]:
+        """The measured value, the action without the integral, and by what the integral grows."""
+        last, value = state[1], self._value(seen, self.of)
+        error = self._value(seen, self.setpoint) - value
         change = either(last != last, 0.0, value - last)  # it is NaN in the first step
         rest = self.offset + self.kp * (error - self.td * change / self.time_step)
-        if self.ti is None:
-            return rest, (integral, value)
-        growth = self.kp * error * self.time_step / self.ti
-        wanted = rest + integral + growth
-        beyond = wanted - limited(wanted, self._low, self._high)
-        integral = either(beyond * growth > 0, integral, integral + growth)
-        return rest + integral, (integral, value)
+        return value, rest, None if self.ti is None else self.kp * error * self.time_step / self.ti
 
 
 class LQR(Controller):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller, FloatArray, either
+from fmugym.baselines.law import Decided, Law
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.errors import ConfigError, shown
 
@@ -18,7 +18,7 @@ __all__ = ["Constant", "Random", "Schedule"]
 _DAY: Final = 86400.0
 
 
-class Constant(Controller):
+class Constant(Law):
     """Gives the same action in every step.
 
     Args:
@@ -29,6 +29,7 @@ class Constant(Controller):
         self.action = action
 
     def _prepare(self) -> None:
+        super()._prepare()
         try:
             taken = self._as_actions(self._decide(np.empty((1, 0))))[0]
             is_element = np.allclose(taken, self.action)  # but for its rounding to float32
@@ -37,8 +38,9 @@ class Constant(Controller):
         if not is_element:
             raise ConfigError(f"the action {shown(self.action)} is not in {shown(self.space)}")
 
-    def _decide(self, rows: FloatArray) -> FloatArray:
-        return np.stack([np.asarray(self.action, dtype=np.float64)] * len(rows))
+    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+        """See ``Law.law``."""
+        return np.ravel(self.action).astype(np.float64).tolist(), ()
 
 
 class Random(Controller):
@@ -61,14 +63,21 @@ class Random(Controller):
         return np.asarray(samples, dtype=np.float64)
 
 
-class Schedule(Controller):
+class Schedule(Law):
     """Gives actions by the time of day, counted from the beginning of the episode.
 
     Args:
         actions: The action from each time on, such as ``{"06:00": 1.0, "22:00": 0.0}``. Before the
             first time, the last one of the day before holds.
         start: The time of day at which an episode begins.
+
+    Attributes:
+        clock: What tells the time in seconds since any midnight; None to count it from ``start``.
     """
+
+    signals = ("clock",)
+    starts = (0.0,)
+    clock: str | None = None
 
     def __init__(self, actions: Mapping[str, float], start: str = "00:00") -> None:
         times = {
@@ -77,36 +86,32 @@ class Schedule(Controller):
         }
         if not times:
             raise ConfigError("a schedule needs at least one time")
-        self._times = np.array(sorted(times))
-        self._actions = np.array([times[time] for time in self._times])
+        self._actions = dict(sorted(times.items()))
         self._start = _seconds(start)
 
     @property
     def values(self) -> list[float]:
         """The actions, in the order of their times."""
-        return [float(action) for action in self._actions]
+        return [*self._actions.values()]
 
     def _prepare(self) -> None:
         self._limits()
-        self._steps = np.zeros(self.count)
+        super()._prepare()
 
-    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
-        self._steps = np.where(mask, 0.0, self._steps)
+    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+        """See ``Law.law``; the controller remembers the number of steps."""
+        (steps,) = state
+        time = self._start + steps * self.time_step
+        return [self._at(time if self.clock is None else self._value(seen, self.clock))], (
+            steps + 1.0,
+        )
 
-    def _decide(self, rows: FloatArray) -> FloatArray:
-        time = self._start + self._steps * self.time_step
-        self._steps = self._steps + 1
-        return self.at(time)
-
-    def at(self, time: FloatArray) -> FloatArray:
-        """The actions at some times.
-
-        Args:
-            time: In seconds since any midnight.
-        """
-        places = np.searchsorted(self._times, time % _DAY, side="right") - 1
-        found: FloatArray = np.take(self._actions, places % len(self._actions))
-        return found
+    def _at(self, time: Any) -> Any:
+        """The action at a time in seconds since any midnight."""
+        action, now = self.values[-1], time % _DAY
+        for begin, value in self._actions.items():
+            action = either(now >= begin, value, action)
+        return action
 
 
 def _seconds(time: Any) -> float:

@@ -14,7 +14,7 @@ from fmugym.expressions.graph import Graph
 from fmugym.expressions.language import Expression, Names
 from fmugym.expressions.value import Value
 
-__all__ = ["Formula", "formula_of", "of_rows"]
+__all__ = ["Formula", "formula_of", "of_columns"]
 
 Formula = Callable[[Sequence[Value]], Value]
 """A function of the elements of an observation."""
@@ -46,12 +46,12 @@ def formula_of(text: str, names: Sequence[str]) -> Formula:
     return formula
 
 
-def of_rows(formula: Formula, width: int) -> Callable[[Any], Any]:
-    """The function of observations, shape (N, width), that gives the values, shape (N,)."""
+def of_columns(formula: Formula, width: int) -> Callable[[Sequence[Any]], Any]:
+    """The function of the elements of observations, each of shape (N,), that gives the values."""
     graph = Graph()
     value = formula([Value.read(graph, "columns", place) for place in range(width)])
     constant = value.constant
     if constant is not None:
-        return lambda rows: np.full(len(rows), float(constant))
+        return lambda columns: np.full(len(columns[0]), float(constant))
     evaluate = function_of(value)
-    return lambda rows: evaluate(SimpleNamespace(columns=rows.T))
+    return lambda columns: evaluate(SimpleNamespace(columns=columns))

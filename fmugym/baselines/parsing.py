@@ -7,6 +7,7 @@ import inspect
 import math
 import re
 import shlex
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeGuard
@@ -17,6 +18,16 @@ from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
 from fmugym.baselines.mpc import MPC
+from fmugym.baselines.table import ControllerTable, Signal, naming
+from fmugym.baselines.table_texts import (
+    controller_in,
+    is_table,
+    named_controllers,
+    table_in,
+    text_of,
+    with_controller,
+)
+from fmugym.checks import check_text
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
 
@@ -52,18 +63,22 @@ _MARGIN: Final = 0.01
 """A number is at an end of its range within this fraction of the range."""
 
 
-def controller_of(text: str) -> Controller:
+def controller_of(text: str | Mapping[str, Any]) -> Controller:
     """Make the controller that a text names.
 
     Args:
         text: ``"pid of=T setpoint=21 kp=0.5 ti=14400"``, ``"hysteresis of=T setpoint=T_set
             band=0.5"`` with the arguments of the classes, ``"schedule 06:00=1 22:00=0.3"``, or
-            ``"mpc horizon=24h warm='pid of=T setpoint=21 kp=0.5'"``.
+            ``"mpc horizon=24h warm='pid of=T setpoint=21 kp=0.5'"``. Or a dict with such a text,
+            or a number, for each action; its text is a table of TOML,
+            ``'{ u = "pid of=T setpoint=21 kp=0.5", v = 0 }'``.
 
     Raises:
         ConfigError: If there is no such controller, or its arguments are wrong.
     """
-    kind, arguments = _parts(text)
+    if is_table(text):
+        return _table(table_in(text), {})
+    kind, arguments = _parts(check_text("controller", text))
     if kind == "schedule":
         return Schedule(arguments)
     for name, value in arguments.items():
@@ -88,25 +103,26 @@ def _parts(text: str) -> tuple[str, dict[str, Any]]:
     return kind, dict(map(_argument, words))
 
 
-@dataclass(frozen=True)
-class Search:
+class Search(ABC):
     """A controller some of whose numbers are to be found.
 
     Attributes:
-        kind: The name of its class in texts.
-        fixed: The arguments that are given.
         ranges: The numbers to be found, each with the values to be tried.
-        negative: The names of those whose values are minus those in ``ranges``.
     """
 
-    kind: str
-    fixed: Mapping[str, Any]
     ranges: Mapping[str, Uniform | LogUniform]
-    negative: frozenset[str] = frozenset()
 
+    @abstractmethod
     def make(self, **numbers: Any) -> Controller:
         """Make the controller with some numbers, which are rounded as in ``text``."""
-        return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
+
+    @abstractmethod
+    def text(self, numbers: Mapping[str, Any]) -> str:
+        """The controller with some numbers, as ``controller_of`` reads it."""
+
+    @abstractmethod
+    def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
+        """The numbers as ``text`` has them."""
 
     def middle(self) -> Controller:
         """Make the controller with the middle of each range."""
@@ -118,23 +134,44 @@ class Search:
         }
         return self.make(**middles)
 
+    def at_an_end(self, found: Mapping[str, float]) -> list[str]:
+        """The numbers that are within a hundredth of an end of their ranges."""
+        return [name for name, one in self.ranges.items() if _is_at_an_end(one, found[name])]
+
+
+@dataclass(frozen=True)
+class TextSearch(Search):
+    """The search for numbers of a controller that a text names.
+
+    Attributes:
+        kind: The name of its class in texts.
+        fixed: The arguments that are given.
+        ranges: See ``Search``.
+        negative: The names of those whose values are minus those in ``ranges``.
+    """
+
+    kind: str
+    fixed: Mapping[str, Any]
+    ranges: Mapping[str, Uniform | LogUniform]
+    negative: frozenset[str] = frozenset()
+
+    def make(self, **numbers: Any) -> Controller:
+        """See ``Search.make``."""
+        return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
+
     def text(self, numbers: Mapping[str, Any]) -> str:
-        """The controller with some numbers, as ``controller_of`` reads it."""
+        """See ``Search.text``."""
         found = self.numbers(numbers)
         given = {name: found.get(name, value) for name, value in self._in_order().items()}
         words = [f"{name}={str(value).removesuffix('.0')}" for name, value in given.items()]
         return shlex.join([self.kind, *words])
 
     def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """The numbers as ``text`` has them."""
+        """See ``Search.numbers``."""
         return {
             name: _rounded(-value if name in self.negative else value)
             for name, value in found.items()
         }
-
-    def at_an_end(self, found: Mapping[str, float]) -> list[str]:
-        """The numbers that are within a hundredth of an end of their ranges."""
-        return [name for name, one in self.ranges.items() if _is_at_an_end(one, found[name])]
 
     def _in_order(self) -> dict[str, Any]:
         everything = {**self.fixed, **self.ranges}
@@ -142,18 +179,96 @@ class Search:
         return {name: everything[name] for name in order if name in everything}
 
 
-def search_of(text: str) -> Search:
+@dataclass(frozen=True)
+class TableSearch(Search):
+    """The search for all numbers of a table, whose names are such as ``"u.kp"``.
+
+    Attributes:
+        entries: Those of the table.
+        searches: By entry, those of the controllers that have ranges.
+    """
+
+    entries: Mapping[str, Any]
+    searches: Mapping[str, Search]
+
+    @property
+    def ranges(self) -> Mapping[str, Uniform | LogUniform]:  # type: ignore[override]
+        """See ``Search``."""
+        return {
+            f"{name}.{key}": one
+            for name, search in self.searches.items()
+            for key, one in search.ranges.items()
+        }
+
+    def make(self, **numbers: Any) -> Controller:
+        """See ``Search.make``."""
+        own = self._divided(numbers)
+        return _table(self.entries, {n: one.make(**own[n]) for n, one in self.searches.items()})
+
+    def text(self, numbers: Mapping[str, Any]) -> str:
+        """See ``Search.text``."""
+        own = self._divided(numbers)
+        texts = {name: one.text(own[name]) for name, one in self.searches.items()}
+        return text_of(
+            {
+                name: with_controller(entry, texts.get(name, controller_in(entry)))
+                for name, entry in self.entries.items()
+            }
+        )
+
+    def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
+        """See ``Search.numbers``."""
+        own = self._divided(found)
+        return {
+            f"{name}.{key}": value
+            for name, search in self.searches.items()
+            for key, value in search.numbers(own[name]).items()
+        }
+
+    def _divided(self, numbers: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """The numbers of each entry."""
+        found: dict[str, dict[str, Any]] = {name: {} for name in self.searches}
+        for name, value in numbers.items():
+            entry, _, key = name.rpartition(".")
+            found[entry][key] = value
+        return found
+
+
+def search_of(text: str | Mapping[str, Any]) -> Search:
     """Read a controller of which some numbers are ranges.
 
     Args:
         text: As for ``controller_of``, with ``LOW..HIGH`` in the place of numbers that are to be
             found: ``"pid of=T setpoint=20..22 kp=0.05..5 ti=1800..400000"``. A range whose ends
             have one sign and differ by a factor of ten or more is searched on a logarithmic scale.
+            The ranges of all entries of a table count.
 
     Raises:
         ConfigError: If there is no such controller, nothing is to be found, or an argument is
             wrong.
     """
+    search = _table_search(table_in(text)) if is_table(text) else _text_search(str(text))
+    if not search.ranges:
+        raise ConfigError(
+            f"nothing in {shown(text)} is to be found; give a range in the place of a number, "
+            "such as kp=0.05..5"
+        )
+    for end in ("low", "high"):  # raises for wrong arguments
+        search.make(**{name: getattr(one, end) for name, one in search.ranges.items()})
+    return search
+
+
+def _table_search(entries: Mapping[str, Any]) -> TableSearch:
+    given = {name: controller_in(entry) for name, entry in entries.items()}
+    searches = {}
+    for name, one in given.items():
+        if has_range(one):
+            with naming(name):
+                searches[name] = search_of(one)
+    return TableSearch(entries, searches)
+
+
+def _text_search(text: str) -> TextSearch:
     kind, arguments = _parts(text)
     if kind in _UNTUNED:
         known = ", ".join(sorted(_KINDS.keys() - _UNTUNED))
@@ -165,15 +280,7 @@ def search_of(text: str) -> Search:
         for name, (low, high) in ends.items()
     }
     fixed = {name: value for name, value in arguments.items() if name not in ranges}
-    search = Search(kind, fixed, ranges, negative)
-    search.make(**{name: one.low for name, one in ranges.items()})  # raises for wrong arguments
-    search.make(**{name: one.high for name, one in ranges.items()})
-    if not ranges:
-        raise ConfigError(
-            f"nothing in {shown(text)} is to be found; give a range in the place of a number, "
-            "such as kp=0.05..5"
-        )
-    return search
+    return TextSearch(kind, fixed, ranges, negative)
 
 
 def plans_ahead(text: Any) -> bool:
@@ -183,7 +290,8 @@ def plans_ahead(text: Any) -> bool:
 
 def simple_controllers(texts: Mapping[str, Any]) -> list[Controller]:
     """The controllers of a task file that do not plan; ranges in them have their middle."""
-    given = [one for one in texts.values() if isinstance(one, str) and not plans_ahead(one)]
+    named = named_controllers(texts).values()
+    given = [one for one in named if isinstance(one, str) and not plans_ahead(one)]
     return [search_of(one).middle() if has_range(one) else controller_of(one) for one in given]
 
 
@@ -235,6 +343,19 @@ def _argument(word: str) -> tuple[str, Any]:
         with contextlib.suppress(ValueError):
             return name, read(value)
     return name, {"true": True, "false": False}.get(value, value)
+
+
+def _table(entries: Mapping[str, Any], made: Mapping[str, Controller]) -> ControllerTable:
+    """Make a table, some of whose controllers are made already."""
+    found: dict[str, Any] = {}
+    for name, entry in entries.items():
+        given = controller_in(entry)
+        with naming(name):
+            one = controller_of(given) if isinstance(given, str) and name not in made else given
+            one = made.get(name, one)
+            is_signal = isinstance(entry, Mapping)
+            found[name] = Signal(one, entry["min"], entry["max"]) if is_signal else one
+    return ControllerTable(found)
 
 
 def _made(cls: type[Controller], arguments: dict[str, Any]) -> Controller:

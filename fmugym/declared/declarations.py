@@ -167,7 +167,7 @@ class Declarations:
             *(term.expression for term in terms),
             *self.flags.values(),
             *(kpi.expression for kpi in self.kpis.values()),
-            *map(Expression.parse, self.warm_up.signals()),
+            *map(Expression.parse, self.warm_up.measured()),
         ]
 
     def is_output(self, name: str) -> bool:

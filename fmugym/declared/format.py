@@ -632,11 +632,20 @@ SCENARIO: Final = Table(
     }
 )
 
+SIGNAL: Final = Table(
+    {
+        "controller": Key(TEXT, "What gives the signal.", REQUIRED),
+        "min": Key(NUMBER, "Its lowest value.", REQUIRED),
+        "max": Key(NUMBER, "Its highest value.", REQUIRED),
+    },
+    what="key of a signal",
+)
+
 WARM_UP: Final = Table(
     {
         "period": Key(TIME, "The time, a multiple of the time step.", REQUIRED),
         "controller": Key(
-            Either(Entries(CONTROLLER), CONTROLLER),
+            Either(Entries(Either(SIGNAL, CONTROLLER)), CONTROLLER),
             "A text as [on the command line](baselines.md#on-the-command-line), a name from "
             '`controllers`, or a number. `"thermostat"` alone gives the highest action below the '
             "set point and the lowest above it, if the task has one set point `of` something, or "
@@ -964,7 +973,7 @@ TASK: Final = Table(
             Entries(SETPOINT, _MOST_NAMES), "[Set points](task-file.md#set-points) by name."
         ),
         "controllers": Key(
-            Entries(CONTROLLER, _MOST_NAMES),
+            Entries(Either(Entries(Either(SIGNAL, CONTROLLER)), CONTROLLER), _MOST_NAMES),
             "[Controllers](task-file.md#controllers) by name: what agents are compared with, for "
             "the warm-up, and for `--controller` on the command line.",
         ),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from gymnasium import spaces
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.variables import TaskVariable
-from fmugym.declared.warming import signals_of
+from fmugym.declared.warming import CLOCK
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of
@@ -23,7 +22,7 @@ from fmugym.expressions.value import Value
 from fmugym.task.warm_up import WarmUp
 
 if TYPE_CHECKING:
-    from fmugym.baselines import Controller
+    from fmugym.baselines import ControllerTable
 
 __all__ = ["DeclaredWarmUp"]
 
@@ -51,69 +50,77 @@ def _described(graph: Graph, roots: Sequence[int]) -> list[Any]:
 
 
 class Pilot:
-    """A controller and its action.
+    """The controllers of a warm-up and their actions.
 
     Args:
         naming: Gives names their values.
-        variable: The variable that the controller writes.
-        controller: Chooses the value, in the unit of the task.
+        controllers: Choose the values, in the units of the task.
 
     Attributes:
-        variable, controller: As given.
-        place: The place of its action.
-        values: What it measures.
+        controllers: As given.
+        values: What they measure.
     """
 
-    def __init__(self, naming: Naming, variable: TaskVariable, controller: Controller) -> None:
-        self.variable, self.controller, self._declared = variable, controller, naming.declared
-        self.place = naming.declared.actions.index(variable)
-        self._names = tuple(signals_of(controller))
+    def __init__(self, naming: Naming, controllers: ControllerTable) -> None:
+        self.controllers, self._declared = controllers, naming.declared
+        actions = naming.declared.actions
+        self._variables = {
+            place: variable
+            for place, variable in enumerate(actions)
+            if variable.alias in controllers.acting
+        }
+        self._names = tuple(controllers.measured())
+        self._is_measured = np.array([name != CLOCK for name in self._names], dtype=bool)
         entry = naming.declared.warm_up.entry.child("controller")
         measured = map(Expression.parse, self._names)
         self.values = [naming.value(entry, one, Moment.SEEN).number for one in measured]
-        self._signals, self._clock = function_of(self.values), function_of(naming.clock)
-        self._present = function_of(naming.present(variable)) if variable.delta else None
+        self._read = function_of(self.values)
+        self._present = {
+            place: function_of(naming.present(variable))
+            for place, variable in self._variables.items()
+            if variable.delta
+        }
 
     def bind(self, count: int, time_step: float) -> None:
         """Prepare for the warm-up of some environments.
 
         Raises:
-            ConfigError: If the controller does not fit the action.
+            ConfigError: If a controller does not fit its action.
         """
-        low, high = self.variable.range
-        space = spaces.Box(np.float32(low), np.float32(high), (1,), np.float32)
-        env = SimpleNamespace(
-            num_envs=count, single_action_space=space, time_step=time_step, unphysical_keys=()
-        )
-        env.unwrapped = env.config = env
-        self.controller.bind(env, self._names)
+        low, high = np.array([one.range for one in self._variables.values()], np.float32).T
+        names = tuple(variable.alias for variable in self._variables.values())
+        space = spaces.Box(low, high, dtype=np.float32)
+        self.controllers.attach(space, self._names, names, time_step, count)
 
-    def act(self, env: Any) -> Any:
-        """Choose the next action, as the agent would write it, shape (M,)."""
-        value = self._decided(env)
+    def act(self, env: Any) -> dict[int, Any]:
+        """Choose the next actions, as the agent would write them: by place, shape (M,)."""
+        chosen = self.controllers.act(self._rows(env)).astype(np.float64).T
+        pairs = zip(self._variables.items(), chosen, strict=True)
+        return {
+            place: self._as_agent(env, place, variable, value) for (place, variable), value in pairs
+        }
+
+    def _rows(self, env: Any) -> Any:
+        """What is measured; controllers work with numbers of float32."""
+        rows = np.empty((len(env.step_count), len(self._names)))
+        for place, signal in enumerate(self._read(env)):
+            rows[:, place] = signal
+        rows[:, self._is_measured] = rows[:, self._is_measured].astype(np.float32)
+        return rows
+
+    def _as_agent(self, env: Any, place: int, variable: TaskVariable, value: Any) -> Any:
+        """A value in the unit of the task in the form in which the agent writes it."""
         if self._declared.is_physical:
             return value
-        if self.variable.levels:
-            order = np.argsort(self.variable.levels)  # the lower of two levels counts as nearer
-            distances = np.abs(np.array(self.variable.levels)[order, None] - value)
+        if variable.levels:
+            order = np.argsort(variable.levels)  # the lower of two levels counts as nearer
+            distances = np.abs(np.array(variable.levels)[order, None] - value)
             return order[distances.argmin(axis=0)]
-        if self._present is not None:
-            value = np.clip(value - self._present(env), -self.variable.delta, self.variable.delta)
-        low, high = self.variable.chosen
+        if place in self._present:
+            value = np.clip(value - self._present[place](env), -variable.delta, variable.delta)
+        low, high = variable.chosen
         is_rescaled = self._declared.rescales
         return (value - (low + high) / 2) / ((high - low) / 2) if is_rescaled else value
-
-    def _decided(self, env: Any) -> Any:
-        """The value in the unit of the task; controllers work with numbers of float32."""
-        from fmugym.baselines import Schedule
-
-        one: Any = self.controller
-        if isinstance(one, Schedule):
-            return np.clip(one.at(self._clock(env)), *self.variable.limits)
-        rows = np.empty((len(env.step_count), len(self._names)), np.float32)
-        for place, signal in enumerate(self._signals(env)):
-            rows[:, place] = signal
-        return one.act(rows)[:, 0].astype(np.float64)
 
 
 class DeclaredWarmUp(WarmUp):
@@ -143,19 +150,13 @@ class DeclaredWarmUp(WarmUp):
         self.caches = table.caches
         self._inputs, self._update = function_of(tuple(inputs)), update
         self.writes = tuple(written)
-        self._pilots = [
-            Pilot(naming, variable, table.controllers[variable.alias])
-            for variable in declared.actions
-            if variable.alias in table.controllers
-        ]
-        parts = [inputs, *(pilot.values for pilot in self._pilots), *written.values()]
+        self._pilot = None if table.controllers is None else Pilot(naming, table.controllers)
+        measured = [] if self._pilot is None else self._pilot.values
+        parts = [inputs, measured, *written.values()]
         roots = [value.node for part in (*parts, [naming.clock]) for value in part]
         needed = naming.graph.needed(roots)
         self.depends_on = variables_in([naming.graph.nodes[number] for number in needed])
-        told = [
-            repr((one.variable.alias, type(one.controller), vars(one.controller)))
-            for one in self._pilots
-        ]
+        told = None if table.controllers is None else table.controllers.told()
         content = repr((self.steps, self._time_step, told, _described(naming.graph, roots)))
         self.digest = sha256(content.encode()).hexdigest()
         with table.entry.placing():
@@ -165,14 +166,15 @@ class DeclaredWarmUp(WarmUp):
 
     def begin(self, count: int) -> None:
         """See ``WarmUp.begin``."""
-        for pilot in self._pilots:
-            pilot.bind(count, self._time_step)
+        if self._pilot is not None:
+            self._pilot.bind(count, self._time_step)
 
     def inputs(self, env: Any) -> Any:
         """See ``WarmUp.inputs``; the controllers act first."""
         env.previous_action, env.action = env.action, np.array(env.action)
-        for pilot in self._pilots:
-            env.action[pilot.place if env.action.ndim > 1 else ...] = pilot.act(env)
+        chosen = {} if self._pilot is None else self._pilot.act(env)
+        for place, value in chosen.items():
+            env.action[place if env.action.ndim > 1 else ...] = value
         return self._inputs(env)
 
     def update(self, env: Any) -> None:

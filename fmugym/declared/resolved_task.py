@@ -79,6 +79,7 @@ class ResolvedTask:
         hooks: Functions of the environment by the names of the hooks that they are, for spaces and
             for what is said of rewards.
         observation_names: The names of the elements of the observation.
+        action_names: Those of the action.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if the actions have no levels.
         warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
@@ -124,6 +125,7 @@ class ResolvedTask:
         self.formulas = self._make_formulas()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_rewards()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
+        self.action_names = tuple(variable.alias for variable in declared.actions)
         self.warm_up = self._make_warm_up() if self._naming.warm_steps else None
         self.action_masks = self._action_masks()
         self.unphysical_keys, self.expressions = declared.unphysical_keys, declared.expressions
@@ -177,7 +179,7 @@ class ResolvedTask:
         for memory in self._declared.memory.values():
             if memory.update is not None:
                 yield memory.entry, memory.update, Moment.AFTER
-        for name in self._declared.warm_up.signals():
+        for name in self._declared.warm_up.measured():
             entry = self._declared.warm_up.entry.child("controller")
             yield entry, Expression.parse(name), Moment.SEEN
 
@@ -196,7 +198,7 @@ class ResolvedTask:
         written |= {name: [value] for name, value in self._switched().items()}
         return DeclaredWarmUp(
             self._naming,
-            self._input_values(self._declared.warm_up.controllers),
+            self._input_values(self._declared.warm_up.acting),
             update_by([*self._updates_of_histories(), self._switched()]),
             written,
             self.config,

@@ -77,6 +77,7 @@ class TaskEnv(FMUEnv):
                 "what happens in the warm-up"
             )
         self._observation_names, self._masks = resolved.observation_names, resolved.action_masks
+        self._action_names = resolved.action_names
         own = _own_hooks(type(self))
         own |= {"_explain"} if "_reward_policy" in own else set()
         for name, function in resolved.hooks.items():
@@ -99,6 +100,11 @@ class TaskEnv(FMUEnv):
         if "_get_observation" in _own_hooks(type(self)):
             return None
         return self._observation_names
+
+    @property
+    def action_names(self) -> tuple[str, ...] | None:
+        """The names of the action's elements; None if a hook of a class makes inputs of it."""
+        return None if "_get_inputs" in _own_hooks(type(self)) else self._action_names
 
     def action_masks(self) -> Any:
         """Tell which levels of the actions take effect now, as MaskablePPO of sb3-contrib asks.

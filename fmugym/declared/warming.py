@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 from fmugym.checks import Spellings, check_text, normal_form, number_of
 from fmugym.declared.entries import Entry
@@ -14,9 +14,13 @@ from fmugym.errors import ConsequenceError, shown, unknown_name
 from fmugym.expressions.language import Expression
 
 if TYPE_CHECKING:
-    from fmugym.baselines import Controller
+    from fmugym.baselines import Controller, ControllerTable, Signal
+    from fmugym.baselines.law import Law
 
-__all__ = ["WarmUpTable", "read_warm_up", "signals_of"]
+__all__ = ["CLOCK", "WarmUpTable", "read_warm_up"]
+
+CLOCK: Final = "clock"
+"""What schedules of a warm-up read; it is not rounded as measured values are."""
 
 THERMOSTATS: Final = ("thermostat", "hysteresis")
 """The names of a controller whose arguments the task may tell."""
@@ -29,25 +33,24 @@ class WarmUpTable:
     Attributes:
         entry: Where it stands.
         period: Its length in seconds.
-        controllers: By the alias of an action, what acts on it; others keep their start values.
+        controllers: What acts on actions, by their aliases; others keep their start values. None if
+            nothing acts.
         caches: Whether to keep the state that it leads to.
     """
 
     entry: Entry
     period: float = 0.0
-    controllers: Mapping[str, Controller] = field(default_factory=dict)
+    controllers: ControllerTable | None = None
     caches: bool = False
 
-    def signals(self) -> list[str]:
-        """The names of what the controllers measure."""
-        named = [name for one in self.controllers.values() for name in signals_of(one)]
-        return list(dict.fromkeys(named))
+    @property
+    def acting(self) -> list[str]:
+        """The aliases of the actions on which something acts."""
+        return [] if self.controllers is None else list(self.controllers.acting)
 
-
-def signals_of(controller: Controller) -> list[str]:
-    """What a controller measures, and its set point: names and other expressions."""
-    given = (getattr(controller, name, None) for name in ("of", "setpoint"))
-    return [name for name in given if isinstance(name, str)]
+    def measured(self) -> list[str]:
+        """What the controllers measure: names and other expressions."""
+        return [] if self.controllers is None else self.controllers.measured()
 
 
 def read_warm_up(
@@ -64,44 +67,82 @@ def read_warm_up(
         controlled: What is measured and its set point, in pairs, for a thermostat.
         name_of: Returns a name as it is declared.
     """
-    known = _named_controllers(root)
+    known = root.child("controllers").items()
+    for one in known.values():
+        with one.noting():
+            _require_controller(one, known)
     entry = root.child("warm_up")
     if entry.value is None:
         return WarmUpTable(entry)
-    controllers: dict[str, Controller] = {}
-    for name, one in _by_action(entry.child("controller"), actions).items():
+    given = _by_action(entry.child("controller"), actions, known)
+    found: dict[str, Any] = {}
+    for name, one in given.items():
         with one.noting():
+            if isinstance(one.value, Mapping):
+                found[name] = _signal(one, known, name_of)
+                continue
             variable = _action_of(one, name, actions)
-            controllers[variable.alias] = controller = (
+            found[variable.alias] = controller = (
                 _thermostat(one, variable, controlled)
                 if one.value in THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
             _rename(controller, name_of)
             check_controller(one, variable, controller)
+    controllers = None
+    if found and len(found) == len(given):
+        with entry.child("controller").noting():
+            controllers = _table(found)
     return WarmUpTable(
         entry, entry.value.get("period", 0.0), controllers, entry.value.get("cache", False)
     )
 
 
-def _rename(controller: Controller, name_of: Callable[[str], str]) -> None:
-    for key in ("of", "setpoint"):
-        if isinstance(signal := getattr(controller, key, None), str) and signal.isidentifier():
+def _table(entries: Mapping[str, Any]) -> ControllerTable:
+    """The table of what acts; its schedules go by the clock."""
+    from fmugym.baselines import ControllerTable, Schedule
+
+    table = ControllerTable(entries)
+    for law in table.laws():
+        if isinstance(law, Schedule):
+            law.clock = CLOCK
+    return table
+
+
+def _signal(entry: Entry, known: Mapping[str, Entry], name_of: Callable[[str], str]) -> Signal:
+    """A signal between controllers."""
+    from fmugym.baselines import Signal
+
+    controller = _acting(entry.required("controller"), known)
+    _rename(controller, name_of)
+    with entry.placing():
+        return Signal(controller, entry.value["min"], entry.value["max"])
+
+
+def _rename(controller: Law, name_of: Callable[[str], str]) -> None:
+    for key in controller.signals:
+        if isinstance(signal := getattr(controller, key), str) and signal.isidentifier():
             setattr(controller, key, name_of(signal))
 
 
-def _named_controllers(root: Entry) -> dict[str, Entry]:
-    """The controllers that a task names; each of them is checked, also one with ranges."""
+def _require_controller(entry: Entry, known: Mapping[str, Entry]) -> None:
+    """Check a controller that the task names, also one with ranges."""
     from fmugym.baselines.parsing import has_range, search_of
+    from fmugym.baselines.table_texts import is_table, resolved
 
-    known = root.child("controllers").items()
-    for one in known.values():
-        with one.noting():
-            if has_range(one.value):
-                search_of(one.value)
-            else:
-                _controller(one, {})
-    return known
+    if not is_table(entry.value):
+        if has_range(entry.value):
+            search_of(entry.value)
+        else:
+            _controller(entry, {})
+        return
+    text = resolved(entry.value, {name: one.value for name, one in known.items()})
+    if has_range(text):
+        search_of(text)
+    else:
+        from fmugym.baselines import controller_of
+
+        _require_expressions(controller_of(text))
 
 
 def _thermostat(
@@ -130,7 +171,13 @@ def _thermostat(
     )
 
 
-def _by_action(entry: Entry, actions: Sequence[TaskVariable]) -> dict[str, Entry]:
+def _by_action(
+    entry: Entry, actions: Sequence[TaskVariable], known: Mapping[str, Entry]
+) -> dict[str, Entry]:
+    """The entries of a table, which may have a name; one entry if there is one action."""
+    named = known.get(entry.value) if isinstance(entry.value, str) else None
+    if named is not None and isinstance(named.value, Mapping):
+        entry = named
     if entry.value is None or isinstance(entry.value, Mapping):
         return entry.items()
     names = [variable.alias for variable in actions]
@@ -154,7 +201,7 @@ def _action_of(entry: Entry, name: str, actions: Sequence[TaskVariable]) -> Task
     raise unknown_name("action", name, [variable.alias for variable in actions])
 
 
-def _acting(entry: Entry, known: Mapping[str, Entry]) -> Controller:
+def _acting(entry: Entry, known: Mapping[str, Entry]) -> Any:
     from fmugym.baselines import MPC
 
     controller = _controller(entry, known)
@@ -183,6 +230,13 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
             raise unknown_name("controller", text, known)
         controller = controller_of(text)
     with entry.placing():
-        for signal in signals_of(controller):
-            Expression.parse(signal)
+        _require_expressions(controller)
     return controller
+
+
+def _require_expressions(controller: Controller) -> None:
+    """Refuse what is no expression in what a controller measures."""
+    from fmugym.baselines.law import Law
+
+    for signal in controller.measured() if isinstance(controller, Law) else ():
+        Expression.parse(signal)

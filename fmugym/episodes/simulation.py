@@ -12,6 +12,7 @@ import numpy as np
 
 from fmugym.baselines import controller_of
 from fmugym.baselines.controller import require_physical
+from fmugym.baselines.table_texts import resolved
 from fmugym.checks import Spellings, number_of
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
@@ -145,11 +146,11 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
     Raises:
         ConfigError: If it names no controller, or the controller does not fit the environment.
     """
-    named = _named_controllers(env)
-    own = Spellings("controller of the task", named).find(text)
-    if own is None and named and text.isidentifier():
-        raise unknown_name("controller of the task", text, named)
-    given = text if own is None else named[own]
+    known = _named_controllers(env)
+    own = Spellings("controller of the task", known).find(text)
+    if own is None and known and text.isidentifier():
+        raise unknown_name("controller of the task", text, known)
+    given = resolved(text if own is None else known[own], known)
     if not isinstance(given, str):
         return action_of(env, str(given))
     return policy_of_controller(controller_of(given), env)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
@@ -10,7 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena, most_steps_of
-from fmugym.baselines.parsing import plans_ahead
+from fmugym.baselines.parsing import plans_ahead, simple_controllers
+from fmugym.baselines.table_texts import named_controllers
 from fmugym.declared.likely_units import require_units
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -79,17 +80,9 @@ class Probe:
             policy, task = Policy(None).bind(env), task_of(env)
             require_units(env)
             guesses = guessed_controllers(task, env)
+            agents = list(_declared(task, env, tell))
             length = most_steps_of(env)
             limits = dict(getattr(env, "cost_limits", {}))
-        declared = [
-            Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")
-            for name, one in task.get("controllers", {}).items()
-            if not plans_ahead(one)
-        ]
-        agents = declared if len(policy.choices or policy.limits) == 1 else []
-        if declared != agents:
-            left_out = ", ".join(one.name for one in declared)
-            tell(f"left out: {left_out}: there are several actions, and each gives one")
         linear = Agent("linear", None, len(policy.names), policy.acting)
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
@@ -128,6 +121,21 @@ class Probe:
     def round_time(self, episodes: int) -> float:
         """About how many seconds a round of a controller takes, until episodes become longer."""
         return self.seconds * self.usual_steps * FEW * episodes
+
+
+def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) -> Iterator[Agent]:
+    """The controllers that a task declares, that do not plan ahead and that fit its actions."""
+    for name, one in named_controllers(task.get("controllers", {})).items():
+        if plans_ahead(one):
+            continue
+        agent = Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")
+        try:
+            (controller,) = simple_controllers({name: agent.text})
+            controller.bind(env)
+        except ConfigError as error:
+            tell(f"left out: {name}: {error}")
+        else:
+            yield agent
 
 
 def task_of(env: Any) -> dict[str, Any]:

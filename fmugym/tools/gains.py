@@ -9,6 +9,7 @@ from typing import Final
 
 from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
+from fmugym.baselines.table_texts import is_table, table_in
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.options import (
     Commands,
@@ -99,7 +100,8 @@ def _show(search: Search, found: list[Tuning], arguments: argparse.Namespace) ->
     best, output = found[-1], arguments.output
     text = search.text(best.parameters)
     if output is not None:
-        write_extension(output, arguments.task, {"controllers": {arguments.name: text}})
+        found_one = table_in(text) if is_table(text) else text
+        write_extension(output, arguments.task, {"controllers": {arguments.name: found_one}})
     for name in search.at_an_end(best.parameters):
         note(f"the best {name} is at an end of its range; a wider one may have a better one")
     facts = {"controller": text, "parameters": search.numbers(best.parameters)}

@@ -373,7 +373,7 @@ class Stub:
     """An environment, or N of them, of which only the spaces are there."""
 
     unphysical_keys = ()
-    observation_names = None
+    observation_names = action_names = None
     config = SimpleNamespace(time_step=0.1)
 
     def __init__(self, observed, acting, count=None, names=None):

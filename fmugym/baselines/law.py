@@ -1,0 +1,75 @@
+"""Controllers whose decision follows from formulas, which are played and exported alike."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.baselines.controller import Controller, FloatArray, Numbers
+from fmugym.expressions.value import Value
+
+__all__ = ["Decided", "Law"]
+
+Decided = tuple[Sequence[Any], tuple[Any, ...]]
+"""The elements of an action before they are limited, and what a controller remembers then."""
+
+
+class Law(Controller):
+    """A controller whose next action follows from what it sees and a few numbers.
+
+    Attributes:
+        starts: The numbers that it remembers, at the beginning of an episode.
+        signals: The attributes that are signals.
+    """
+
+    starts: tuple[Numbers, ...] = ()
+    signals: ClassVar[tuple[str, ...]] = ()
+
+    @abstractmethod
+    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+        """Compute a decision: of arrays element by element, or of formulas.
+
+        Args:
+            seen: The elements of the observation.
+            state: What the controller remembers, in the order of ``starts``.
+            holds: Whether an integral must not grow, because nothing would follow it.
+        """
+
+    @property
+    def integrates(self) -> bool:
+        """Whether it has an integral, which may wind up."""
+        return False
+
+    def wanted(self, seen: Sequence[Any], state: Sequence[Any]) -> Any:
+        """The action that it would take if there were no limits, as its only element."""
+        return self.law(seen, state)[0][0]
+
+    def measured(self) -> list[str]:
+        """What it measures, and its set point: names and other expressions."""
+        given = (getattr(self, name) for name in self.signals)
+        return [one for one in given if isinstance(one, str)]
+
+    def decision(
+        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+    ) -> tuple[Sequence[Value], Sequence[Value]]:
+        """See ``Controller.decision``."""
+        elements, state = self.law(observation, memory)
+        return [observation[0].beside(one) for one in elements], state
+
+    def _prepare(self) -> None:
+        for name in self.signals:
+            if (signal := getattr(self, name)) is not None:
+                self._check_signal(name, signal)
+        self._state = tuple(np.full(self.count, start) for start in self.starts)
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        pairs = zip(self.starts, self._state, strict=True)
+        self._state = tuple(np.where(mask, start, now) for start, now in pairs)
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        elements, self._state = self.law(rows.T, self._state)
+        return np.stack([np.broadcast_to(one, len(rows)) for one in elements], axis=-1)

@@ -1,0 +1,283 @@
+"""A controller of several actions: a table of controllers of one number each, and of cascades."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import reduce
+from graphlib import CycleError, TopologicalSorter
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.baselines.controller import Controller, limited
+from fmugym.baselines.feedforward import Constant
+from fmugym.baselines.law import Decided, Law
+from fmugym.checks import Spellings, check_mapping, check_number
+from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.expressions.language import Expression
+
+__all__ = ["ControllerTable", "Signal", "elements_of", "naming"]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A number between controllers of a cascade: one gives it, others read it by its name.
+
+    Attributes:
+        controller: Gives the number.
+        low, high: Its limits.
+    """
+
+    controller: Law
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        low, high = check_number("min", self.low), check_number("max", self.high)
+        if not low < high:
+            raise ConfigError(f"min must be below max, got {low:g} and {high:g}")
+
+
+class ControllerTable(Law):
+    """A controller of several actions, each of which has a controller of its own.
+
+    Entries that are no actions are signals of a cascade: what a controller gives, within limits, is
+    what others read by the name of the entry, as a set point for example. The integral of an outer
+    controller does not grow where this would only push all that read its signal further beyond
+    their limits.
+
+    Args:
+        entries: By the name of an action a controller of one number, or a number; by any other name
+            a ``Signal``.
+    """
+
+    def __init__(self, entries: Mapping[str, Law | Signal | float]) -> None:
+        given = check_mapping("entries", entries)
+        self.entries = {name: _checked(name, one) for name, one in given.items()}
+        self._readers = {name: self._readers_of(name) for name in self.cascaded}
+        self._require_read()
+        self._order = self._in_order()
+        self.starts = tuple(start for name in self._order for start in self._law(name).starts)
+
+    @property
+    def cascaded(self) -> list[str]:
+        """The names of the signals."""
+        return [name for name, one in self.entries.items() if isinstance(one, Signal)]
+
+    @property
+    def acting(self) -> dict[str, Law]:
+        """The controllers of the actions, by name."""
+        return {name: one for name, one in self.entries.items() if not isinstance(one, Signal)}
+
+    def laws(self) -> list[Law]:
+        """The controllers of all entries."""
+        return [self._law(name) for name in self.entries]
+
+    def told(self) -> list[tuple[Any, ...]]:
+        """What tells the table from others, before it is bound."""
+        limits = {n: (e.low, e.high) for n, e in self.entries.items() if isinstance(e, Signal)}
+        return [
+            (name, type(self._law(name)), vars(self._law(name)), limits.get(name))
+            for name in self.entries
+        ]
+
+    def _law(self, name: str) -> Law:
+        entry = self.entries[name]
+        return entry.controller if isinstance(entry, Signal) else entry
+
+    def measured(self) -> list[str]:
+        """See ``Law.measured``: what is no signal of the table, nor has one in it."""
+        found: dict[str, None] = {}
+        for text in (text for law in self.laws() for text in law.measured()):
+            names = _names_in(text)
+            read = [name for name in names if self._signal(name)]
+            found |= dict.fromkeys([one for one in names if one not in read] if read else [text])
+        return list(found)
+
+    # How entries depend on each other.
+
+    def _signal(self, name: str) -> str | None:
+        """The signal of a name; None for the name of something else."""
+        return Spellings("signal", self.cascaded).find(name)
+
+    def _read_by(self, name: str) -> set[str]:
+        """The signals that an entry reads."""
+        names = (one for text in self._law(name).measured() for one in _names_in(text))
+        return {signal for one in names if (signal := self._signal(one)) is not None}
+
+    def _readers_of(self, signal: str) -> list[str]:
+        return [name for name in self.entries if signal in self._read_by(name)]
+
+    def _require_read(self) -> None:
+        for name, readers in self._readers.items():
+            if not readers:
+                raise ConfigError(
+                    f"no entry reads the signal {name!r}; write for example setpoint={name} in one"
+                )
+
+    def _in_order(self) -> list[str]:
+        """The names of the entries, each after the signals that it reads.
+
+        Raises:
+            ConfigError: If they go round in a circle.
+        """
+        sorter = TopologicalSorter({name: sorted(self._read_by(name)) for name in self.entries})
+        try:
+            return [*sorter.static_order()]
+        except CycleError as error:
+            circle = " -> ".join(reversed(error.args[1]))
+            raise ConfigError(f"signals are read in a circle: {circle}") from None
+
+    # Its decisions.
+
+    def _prepare(self) -> None:
+        parts = self._parts()
+        signals = [name for name in self._order if name in self._readers]
+        for name in signals:
+            if Spellings("observation", self.names).find(name):
+                raise ConfigError(f"the signal {name!r} has the name of an observation")
+        names = (*self.names, *signals)
+        self._places = {name: place for place, name in enumerate(signals, len(self.names))}
+        for name in self._order:
+            entry = self.entries[name]
+            if isinstance(entry, Signal):
+                parts[name] = spaces.Box(entry.low, entry.high, (1,), np.float64)
+            with naming(name):
+                self._law(name).attach(parts[name], names, None, self.time_step, self.count)
+        self._limits_of = {name: self._law(name)._limits() for name in self._order}
+        super()._prepare()
+
+    def _parts(self) -> dict[str, spaces.Space[Any]]:
+        """The space of each action by the name of its entry.
+
+        Raises:
+            ConfigError: If the entries are not those of the actions. The text says what to do.
+        """
+        parts, names = elements_of(self.space), self.action_names
+        if names is None or len(names) != len(parts):
+            raise ConfigError(
+                "a hook makes something of the actions, so that they have no names; a table of "
+                "controllers needs some: play a task file"
+            )
+        known, self._columns = Spellings("action", names), list[str]()
+        found = {known.find(name): name for name in self.acting}
+        for name in self.acting:
+            if known.find(name) is None:
+                text = unknown_name("action", name, names)
+                raise ConfigError(f"{text}; a signal has 'min' and 'max'")
+        for name in self.cascaded:
+            if known.find(name) is not None:
+                raise ConfigError(f"{name!r} is an action, whose limits the task has")
+        for name in names:
+            if name not in found:
+                text = (
+                    f"the table has no controller of {name!r}; write for example {name} = 0 in it"
+                )
+                raise ConfigError(text)
+            self._columns.append(found[name])
+        return {found[name]: part for name, part in zip(names, parts, strict=True)}
+
+    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+        """See ``Law.law``."""
+        states = dict(self._divided(state))
+        seen = [*seen]
+        self._complete(seen, states)
+        decided: dict[str, Any] = {}
+        for name in self._order:
+            held = self._holds(name, seen, states)
+            (decided[name],), states[name] = self._law(name).law(seen, states[name], held)
+            if name in self._places:
+                seen[self._places[name]] = self._limited(name, decided[name])
+        remembered = tuple(one for name in self._order for one in states[name])
+        return [decided[name] for name in self._columns], remembered
+
+    def _divided(self, state: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
+        """What each entry remembers."""
+        first = 0
+        for name in self._order:
+            last = first + len(self._law(name).starts)
+            yield name, state[first:last]
+            first = last
+
+    def _complete(self, seen: list[Any], states: Mapping[str, Any]) -> None:
+        """Append the signals as they are if nothing holds their integrals."""
+        for name in self._places:
+            (value,), _ = self._law(name).law(seen, states[name])
+            seen.append(self._limited(name, value))
+
+    def _limited(self, name: str, value: Any) -> Any:
+        return limited(value, *self._limits_of[name])
+
+    def _holds(self, name: str, seen: Sequence[Any], states: Mapping[str, Any]) -> Any:
+        """Whether a growing integral would only push the readers of an entry beyond limits."""
+        law = self._law(name)
+        if name not in self._places or not law.integrates:
+            return False
+        (grown,), _ = law.law(seen, states[name])
+        (kept,), _ = law.law(seen, states[name], True)
+        return self._beyond(name, grown, seen, states) > self._beyond(name, kept, seen, states)
+
+    def _beyond(self, name: str, value: Any, seen: Sequence[Any], states: Mapping[str, Any]) -> Any:
+        """How far a value goes beyond what is used of it, by the entry's limits or its readers."""
+        used = self._limited(name, value)
+        beyond = np.abs(value - used)
+        if name not in self._places:
+            return beyond
+        seen = [*seen]
+        seen[self._places[name]] = used
+        readers = [
+            self._beyond(one, self._law(one).wanted(seen, states[one]), seen, states)
+            for one in self._readers[name]
+        ]
+        return beyond + reduce(np.minimum, readers)
+
+
+def elements_of(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
+    """The space of each number of an action.
+
+    Raises:
+        ConfigError: If actions are no numbers.
+    """
+    match space:
+        case spaces.Box():
+            ends = zip(space.low.flat, space.high.flat, strict=True)
+            return [spaces.Box(low, high, (1,), space.dtype.type) for low, high in ends]
+        case spaces.Discrete():
+            return [space]
+        case spaces.MultiDiscrete():
+            pairs = zip(space.nvec.flat, space.start.flat, strict=True)
+            return [spaces.Discrete(int(count), start=int(start)) for count, start in pairs]
+    raise ConfigError(f"a table of controllers gives numbers, but the action space is {space}")
+
+
+@contextmanager
+def naming(entry: str) -> Iterator[None]:
+    """Let errors about an entry of a table name it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{entry}: {error}") from None
+
+
+def _checked(name: str, entry: Any) -> Law | Signal:
+    controller = entry.controller if isinstance(entry, Signal) else entry
+    if isinstance(controller, int | float) and not isinstance(entry, Signal):
+        return Constant(check_number(name, controller, may_be_boolean=True))
+    if isinstance(controller, ControllerTable) or not isinstance(controller, Law):
+        is_one = isinstance(controller, Controller)
+        kind = type(controller).__name__ if is_one else shown(controller)
+        raise ConfigError(
+            f"{name}: expected a controller of one number, such as a PID, a Hysteresis, a Schedule "
+            f"or a number, got {kind}"
+        )
+    return entry
+
+
+def _names_in(text: str) -> list[str]:
+    """The names in a signal: those of an expression, or the whole text."""
+    with suppress(ConfigError):
+        return sorted(Expression.parse(text).names)
+    return [text]
