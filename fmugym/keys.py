@@ -301,6 +301,8 @@ def with_paths(kind: AnyKind, value: Any, path_of: Callable[[str], str]) -> Any:
         case Kind(holds="libraries") | Listed(), list() | tuple():
             inner = kind.kind if isinstance(kind, Listed) else kind
             return [with_paths(inner, one, path_of) for one in value]
+        case Listed(or_one=True), str():
+            return with_paths(kind.kind, value, path_of)
         case Kind(holds="libraries"), str() if os.path.dirname(value):
             path = path_of(value)
             return path if os.path.dirname(path) else f"./{path}"

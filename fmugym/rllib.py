@@ -150,7 +150,7 @@ class _Maker:
     def of(cls, env: Any, kwargs: Mapping[str, Any]) -> _Maker:
         files, left = _Files(), dict(kwargs)
         task = _task_of(env, left)
-        document = None if task is None else task.with_paths(files.add)
+        document = None if task is None else task.with_listed_files().with_paths(files.add)
         paths = {key: files.add(value) for key, value in left.items() if _is_file(value)}
         for key in paths:
             del left[key]

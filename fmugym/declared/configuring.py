@@ -12,7 +12,7 @@ from fmugym.declared.numbers import steps_in
 from fmugym.declared.seasons import read_begin, read_scenarios
 from fmugym.distributions import is_distribution
 
-__all__ = ["bounds_of", "clock_of", "samplings_of", "time_step_of", "times_of"]
+__all__ = ["beginning_of", "bounds_of", "samplings_of", "time_step_of", "times_of"]
 
 
 def time_step_of(root: Entry, description: ModelDescription) -> float:
@@ -51,8 +51,9 @@ def times_of(naming: Naming) -> dict[str, Any]:
 def _start_time(declared: Declarations, length: float) -> Any:
     """The start time of the FMU, or what it is drawn from; a warm-up and the episode follow."""
     root = declared.root
-    start, scenarios = root.child("start_time"), read_scenarios(root.child("scenarios"))
-    found = read_begin(start, scenarios, declared.warm_up.period + length)
+    start, scenarios = root.child("start_time"), read_scenarios(root)
+    span = declared.warm_up.period + length
+    found, _ = read_begin(start, scenarios, span, files=declared.files)
     if is_distribution(found) and root.child("clock").value is not None:
         raise start.error(
             "start_time and clock cannot both be given where the start time is drawn: data follow "
@@ -61,18 +62,22 @@ def _start_time(declared: Declarations, length: float) -> Any:
     return found
 
 
-def clock_of(naming: Naming) -> dict[str, Any]:
-    """The episode variable that tells when an episode begins, if the task has a clock of its own.
+def beginning_of(naming: Naming) -> dict[str, Any]:
+    """The episode variables that tell when an episode begins, and in which files of data.
 
     Raises:
         ConfigError: If there is no time for an episode.
     """
-    root, step = naming.declared.root, naming.time_step
-    clock, scenarios = root.child("clock"), read_scenarios(root.child("scenarios"))
-    if clock.value is None:
-        return {}
+    declared, step = naming.declared, naming.time_step
+    root, scenarios = declared.root, read_scenarios(declared.root)
+    clock, start = root.child("clock"), root.child("start_time")
     length = times_of(naming).get("max_episode_steps", 0) * step
-    return {CLOCK: read_begin(clock, scenarios, length, naming.warm_steps * step)}
+    if clock.value is None:  # the start time is drawn just before the variables
+        before, period = 0.0, declared.warm_up.period + length
+        return read_begin(start, scenarios, period, before, declared.files)[1]
+    before = naming.warm_steps * step
+    begin, files = read_begin(clock, scenarios, length, before, declared.files)
+    return {CLOCK: begin, **files}
 
 
 def samplings_of(naming: Naming) -> dict[str, str]:

@@ -128,7 +128,7 @@ class Rows:
         before, after = (self.told(places[i % len(places)]) for i in (place, place + 1))
         missing = "" if len(places) == len(self.moments) else f"{self._missing}: "
         raise ConfigError(
-            f"{missing}between {before} and {after} there is no value of {shown(self.value.name)} "
+            f"{missing}between {before} and {after} there is no value of {self._named} "
             f"for {_length(distances[place])}, expected at most {_length(longest)}. If a line may "
             'lead across, say so: gaps = "interpolate", or the longest time, such as gaps = "1d"'
         )
@@ -140,7 +140,8 @@ class Rows:
 
     @property
     def _named(self) -> str:
-        return shown(self.value.name)
+        file = f" of {self.value.table}" if self.value.table else ""
+        return f"{shown(self.value.name)}{file}"
 
     @property
     def longest_gap(self) -> float:

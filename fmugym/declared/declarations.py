@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import keyword
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -17,6 +17,7 @@ from fmugym.archive.units import IDENTITY
 from fmugym.checks import normal_form
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_levels
+from fmugym.declared.file_lists import chosen_files, file_lists
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
 from fmugym.declared.kpis import read_kpi
@@ -64,6 +65,7 @@ class Declarations:
             in the unit of the FMU.
         memory, derived: What the task remembers and names, by name.
         series: Data and schedules by name.
+        files: By episode variable, the numbers of the files that an episode may take.
         steps: Set points that jump, by name.
         actions: The variables that the agent writes.
         inputs: Inputs that expressions write, by alias.
@@ -90,6 +92,7 @@ class Declarations:
         self.memory = _read(root, "memory", read_memory)
         self.derived = _read(root, "expressions", read_derived)
         self.series = _read(root, "data", partial(read_data, standard=_standard_offset(root)))
+        self.files = self._read_files()
         self._read_setpoints()
         parameters = _read(root, "parameters", self._parameter)
         self.parameters = self._with_fitted({v.alias: (v, one) for v, one in parameters.values()})
@@ -237,6 +240,14 @@ class Declarations:
             return variable.nominal
         size = max(map(abs, self.limits_of(name)))
         return size if 0 < size < np.inf else None
+
+    def _read_files(self) -> dict[str, Sequence[int]]:
+        with self.root.child("file").noting():
+            lists = file_lists(self.root)
+            chosen = chosen_files(self.root.child("file"), lists)
+            numbers = {variable: range(len(rows)) for variable, rows in lists.items()}
+            return numbers | {variable: (number,) for variable, number in chosen.items()}
+        return {}
 
     def _read_setpoints(self) -> None:
         section = self.root.child("setpoints")

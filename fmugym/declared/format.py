@@ -467,14 +467,22 @@ AGENT: Final = Table(
 
 # Data and set points.
 
+_MOST_FILES: Final = 1000
+
 DATA: Final = Table(
     {
         "file": Key(
-            PATH,
-            "The file. Commas, semicolons or tabs separate cells of a CSV file. A file whose name "
+            Listed(PATH, or_one=True, most=_MOST_FILES),
+            "The file, [several, or a pattern](task-file.md#several-files). Commas, semicolons or tabs separate cells of a CSV file. A file whose name "
             "ends with `.parquet` needs the extra `parquet`. [Weather](task-file.md#weather) of "
             "EnergyPlus and [tables of Modelica](task-file.md#tables-of-modelica) are known by "
             "their first line.",
+        ),
+        "draw": Key(
+            option("shared", "own"),
+            "Of several files, an episode draws those of one place in all lists, or this one by "
+            'itself: `"own"`.',
+            "shared",
         ),
         "column": Key(
             Kind(_column, {"title": "text, positive integer", "type": ["string", "integer"]}),
@@ -628,6 +636,7 @@ SCENARIO: Final = Table(
     {
         "start": Key(MOMENT, "When it begins.", REQUIRED),
         "length": Key(TIME, "How long it is.", REQUIRED),
+        "file": Key(NAMES, "Its files of data, of [several](task-file.md#several-files), by name."),
         **_DESCRIPTION,
     }
 )
@@ -751,9 +760,12 @@ TAG: Final = Table(
     one_of=("node", "register"),
 )
 
+_NOT_LIVE: Final = ("input", "min", "max", "values", "file", "draw")
+
 LIVE: Final = Table(
     {
-        **{n: one for n, one in DATA.keys.items() if n not in {"input", "min", "max", "values"}},
+        **{n: one for n, one in DATA.keys.items() if n not in _NOT_LIVE},
+        "file": DATA.keys["file"]._replace(kind=PATH, text="The file."),
         **_ADDRESSES,
         "count": Key(
             COUNT,
@@ -940,6 +952,13 @@ TASK: Final = Table(
             "The [time of data](task-file.md#clock-and-scenarios) at the beginning of an episode.",
             None,
             "the FMU's time",
+        ),
+        "file": Key(
+            NAMES,
+            "The files of data that all episodes take, of [several](task-file.md#several-files), "
+            "by name.",
+            None,
+            "drawn",
         ),
         "timezone": Key(
             TIMEZONE,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from functools import reduce
 from typing import Any, Final
@@ -16,13 +16,14 @@ from fmugym.declared.declarations import BUILT_IN, Declarations
 from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.numbers import nearest_steps, steps_in
+from fmugym.declared.series import Series
 from fmugym.declared.variables import TaskVariable
 from fmugym.errors import ConfigError, ConsequenceError, unknown_name
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.language import Expression, Names
 from fmugym.expressions.mathematics import clip, maximum
 from fmugym.expressions.value import Value, where
-from fmugym.task.future import Lookup
+from fmugym.task.future import Lookup, Span, distance_of
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 
@@ -264,17 +265,39 @@ class Naming:
     def _value_of_series(self, name: str, moment: Moment) -> Value:
         """The value now. One that holds for a while is, after a step, that of the step."""
         series, shift = self.declared.series[name], self._ahead
+        lookup = self._lookup_of(name, series)
+        distance = distance_of(lookup.spans)
         if series.is_stepped:
             shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self.time_step
-        table, tables = f"series {name}", self.graph.tables
+            shift += 4.0 * float(np.spacing(distance * len(lookup.spans)))  # places round more
+        if not series.variable:
+            place = (self.clock + (shift - series.start)) % series.period
+            return place.interpolated(lookup.key)
+        number = self.read("variables", series.variable).cast(np.int64)
+        start, period = (
+            self._of_file(f"{what} of {name}", values, number)
+            for what, values in zip(Span._fields, zip(*lookup.spans, strict=True), strict=True)
+        )
+        place = (self.clock + (shift - start)) % period + number * distance
+        return place.interpolated(lookup.key)
+
+    def _lookup_of(self, name: str, series: Series) -> Lookup:
+        """The table of a series, which the graph gets if it has none yet."""
         if name not in self.lookups:
-            numbered = [float(len(self.lookups)), series.values[-1]]  # for nobody looks to the left
-            tables[table] = np.concatenate([series.times, series.values, numbered])
+            table, points = f"series {name}", series.points
+            numbered = [float(len(self.lookups))]  # for nobody looks to the left
+            self.graph.tables[table] = np.concatenate([points, numbered, points[-1:]])
             self.lookups[name] = Lookup(
-                tables, table, series.start, series.period, series.is_stepped
+                self.graph.tables, table, series.spans, series.is_stepped, series.variable
             )
-        place = (self.clock + (shift - series.start)) % series.period
-        return place.interpolated(table)
+        return self.lookups[name]
+
+    def _of_file(self, table: str, values: Sequence[float], number: Value) -> Value | float:
+        """The number that belongs to the episode's file."""
+        if len(set(values)) == 1:
+            return values[0]
+        self.graph.tables[table] = np.array(values)
+        return number.taken(table)
 
     def _value_of_steps(self, name: str, moment: Moment) -> Value:
         """The random value now; after a step, that of the step."""

@@ -14,8 +14,8 @@ from gymnasium import spaces
 from fmugym.archive.description import ModelDescription
 from fmugym.declared.blaming import explanation
 from fmugym.declared.configuring import (
+    beginning_of,
     bounds_of,
-    clock_of,
     samplings_of,
     time_step_of,
     times_of,
@@ -140,7 +140,7 @@ class ResolvedTask:
         keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
         clock = function_of(self._naming.clock)
         held_out = held_out_times((self._task.outside or self._task).root)
-        return Future(lookups, keys, clock, tuple((one.start, one.length) for one in held_out))
+        return Future(lookups, keys, clock, tuple(held_out))
 
     def controllers(self) -> list[Any]:
         """Make the controllers that the task declares and that do not plan ahead."""
@@ -170,7 +170,7 @@ class ResolvedTask:
         for kpi in declared.kpis.values():
             yield kpi.entry, partial(self._kpi_value, kpi)
         yield self._root, partial(times_of, self._naming)
-        yield self._root.child("clock"), partial(clock_of, self._naming)
+        yield self._root.child("clock"), partial(beginning_of, self._naming)
         for seen in self._seen:
             yield seen.entry, partial(self._in_form, seen)
 
@@ -234,7 +234,9 @@ class ResolvedTask:
             starts = self._is_on_at_start(variable), _LONG_AGO
             switches |= zip(switch_names(variable), starts, strict=True)
         zeros = dict.fromkeys([*self._worst, *self._updated_kpis], 0.0)
-        variables = memory | clock_of(self._naming) | kept | switches | zeros
+        beginning = beginning_of(self._naming)
+        drawn = beginning | memory if self._declared.files else memory | beginning
+        variables = drawn | kept | switches | zeros
         return variables | self._noise(variables)
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:

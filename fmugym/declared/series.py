@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -12,8 +12,10 @@ import numpy as np
 from fmugym.declared.data_rows import read_rows
 from fmugym.declared.dates import DAY, YEAR, FloatArray
 from fmugym.declared.entries import Entry
+from fmugym.declared.file_lists import files_of, variable_of
 from fmugym.declared.parts import Limits, read_limits
 from fmugym.errors import ConfigError, shown
+from fmugym.task.future import Span, distance_of
 
 __all__ = ["Series", "read_data", "read_schedule"]
 
@@ -36,6 +38,8 @@ class Series:
         is_stepped: Whether the values jump, and hold until the next one.
         limits: For the observation space.
         unit: The unit of the values; None if none is declared.
+        others: Those of the other files, if an episode draws one of several.
+        variable: The episode variable with the number of the file; "" if there is only one.
     """
 
     entry: Entry
@@ -46,6 +50,28 @@ class Series:
     is_stepped: bool
     limits: Limits
     unit: str | None
+    others: tuple[Series, ...] = ()
+    variable: str = ""
+
+    @property
+    def files(self) -> tuple[Series, ...]:
+        """The series of each file, in the order of their numbers."""
+        return (self, *self.others)
+
+    @property
+    def spans(self) -> tuple[Span, ...]:
+        """Those of its files."""
+        return tuple(Span(one.start, one.period) for one in self.files)
+
+    @property
+    def points(self) -> FloatArray:
+        """The places of all files in a table, and the values there; see ``Lookup``."""
+        distance = distance_of(self.spans)
+        places = [one.times + number * distance for number, one in enumerate(self.files)]
+        for own in places:  # the rounding must leave them rising
+            is_same = np.append(np.diff(own) == 0, False)
+            own[is_same] = np.nextafter(own[is_same], -np.inf)
+        return np.concatenate([*places, *(one.values for one in self.files)])
 
     @classmethod
     def of(
@@ -92,22 +118,33 @@ def _require_function(entry: Entry, times: FloatArray, values: FloatArray, perio
 
 
 def read_data(entry: Entry, standard: int | None = None) -> Series:
-    """Read a column of a file, or a list of values.
+    """Read a column of a file or of each of several, or a list of values.
 
     Args:
         entry: Where it is declared.
         standard: The offset of the task's standard time in seconds east of UTC; None for the
             smallest offset of the rows.
 
+    Returns:
+        The series; its limits are those of all files.
+
     Raises:
         ConfigError: If the file or the column is missing, a cell is no number, times do not rise or
             do not tell what they mean, or values are missing for too long. The text says where.
     """
-    table = entry.value
-    if ("file" in table) == ("values" in table):
+    if ("file" in entry.value) == ("values" in entry.value):
         text = "give either 'file' and 'column', or 'values' and 'step'"
         raise entry.lack(text, "file", "values")
-    rows = read_rows(entry, standard)
+    first, *others = (_read_file(one, standard) for one in files_of(entry))
+    if not others:
+        return first
+    lows, highs = zip(first.limits, *(one.limits for one in others), strict=True)
+    limits = min(lows), max(highs)
+    return replace(first, limits=limits, others=tuple(others), variable=variable_of(entry))
+
+
+def _read_file(entry: Entry, standard: int | None) -> Series:
+    rows, table = read_rows(entry, standard), entry.value
     given = table.get("period")
     with entry.child("values" if "values" in table else "column").placing():
         rows.require_no_gap(None if given is not None else rows.period)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from fmugym.declared.data_rows import offsets_of
 from fmugym.declared.dates import HOUR, offset_text, standard_offset
 from fmugym.declared.entries import Entry
+from fmugym.declared.file_lists import files_of
 from fmugym.errors import ConfigError
 
 __all__ = ["StandardTime", "standard_time"]
@@ -60,7 +61,9 @@ def standard_time(root: Entry) -> StandardTime:
 
 
 def _data(root: Entry) -> Iterator[Entry]:
-    yield from root.child("data").items().values()
+    for entry in root.child("data").items().values():
+        with suppress(ConfigError):  # whoever reads the data says what is wrong with them
+            yield from files_of(entry)
     live = root.child("plant").child("data").items().values()
     yield from (entry for entry in live if "file" in entry.value)
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from fmugym.checks import Spellings, check_mapping, check_path, require_regular
 from fmugym.declared.entries import Entry, Source
+from fmugym.declared.file_lists import listed_files
 from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.frames import is_column, with_tables
 from fmugym.declared.seasons import read_scenarios
@@ -212,20 +213,21 @@ class Task:
             ConfigError: If there is no such scenario.
         """
         root = self.begun()
-        section = root.child("scenarios")
-        scenarios = read_scenarios(section)
+        section, scenarios = root.child("scenarios"), read_scenarios(root)
         with section.placing():
             found = Spellings("scenario", scenarios).find(name)
         if found is None:
             root.mistakes.require_none()
             raise section.error(unknown_name("scenario", name, scenarios))
         scenario = scenarios[found]
-        times = {"clock": scenario.start, "episode_length": scenario.length}
+        times: dict[str, Any] = {"clock": scenario.start, "episode_length": scenario.length}
         if "start_time" in self.document and "clock" not in self.document:
             times["start_time"] = scenario.start_after(
                 root.child("warm_up").child("period").value or 0.0
             )
             del times["clock"]
+        files = section.child(found).child("file").value
+        times |= {"file": files} if files else {}
         outside = self.outside or self
         return replace(self, document={**self.document, **times}, outside=outside)
 
@@ -243,6 +245,14 @@ class Task:
                 one.
         """
         return dict(with_paths(TASK, self.document, path_of))
+
+    def with_listed_files(self) -> Task:
+        """Return the task with lists of files in the place of patterns that these fit now."""
+        data = dict(self.document.get("data", {}))
+        for name, entry in self.root.child("data").items().items():
+            if "file" in entry.value:
+                data[name] = {**data[name], "file": listed_files(entry)}
+        return replace(self, document={**self.document, "data": data}) if data else self
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the task to a new TOML file. Reading the file gives an equal task.

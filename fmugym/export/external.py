@@ -55,10 +55,11 @@ def found_in(
 
 
 def _lookup_in(graph: Graph, root: int, series: Any) -> int:
-    points = np.concatenate([series.times, series.values])
     for number in reversed(graph.needed([root])):
         node = graph.nodes[number]
-        if node.kind == "interpolate" and np.array_equal(graph.tables[node.what][:-2], points):
+        if node.kind == "interpolate" and np.array_equal(
+            graph.tables[node.what][:-2], series.points
+        ):
             return number
     raise ConfigError("data that do not change cannot be given from outside")
 

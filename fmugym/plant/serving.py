@@ -131,7 +131,9 @@ class _Twin:
         """What a tag has when some part of a step has passed."""
         if tag.name.startswith(DATA):
             ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
-            return tuple(_at(self._data[tag.name.removeprefix(DATA)], time + ahead).tolist())
+            series = self._data[tag.name.removeprefix(DATA)]
+            own = series.files[int(self.env.variables.get(series.variable, 0))]
+            return tuple(_at(own, time + ahead).tolist())
         if tag.name == "clock":
             return (time,)
         before, after = self._before[tag.name], self._after[tag.name]

@@ -11,6 +11,7 @@ from fmugym.declared import Task
 from fmugym.declared.data_rows import Rows, read_rows, usual_distance
 from fmugym.declared.dates import offset_text
 from fmugym.declared.entries import Entry
+from fmugym.declared.file_lists import files_of
 from fmugym.declared.standard_time import standard_time
 from fmugym.errors import ConfigError, plain
 
@@ -32,20 +33,34 @@ def overview_of_data(task: Task) -> dict[str, Any]:
     except ConfigError as error:
         return {"standard_time": None, "error": str(error), "series": []}
     series = [
-        _series(name, entry, standard.offset)
+        facts
         for name, entry in root.child("data").items().items()
         if "file" in entry.value
+        for facts in _files(name, entry, standard.offset)
     ]
     told = None if standard.offset is None else str(standard)
     return {"standard_time": told, "error": None, "series": series}
 
 
-def _series(name: str, entry: Entry, standard: int | None) -> dict[str, Any]:
+def _files(name: str, entry: Entry, standard: int | None) -> list[dict[str, Any]]:
+    """The facts about each file of a series, with its number if an episode draws one."""
+    try:
+        files = files_of(entry)
+    except ConfigError as error:
+        return [{"name": name, "file": ", ".join(entry.value["file"]), "error": str(error)}]
+    numbers = range(len(files)) if len(files) > 1 else [None]
+    return [
+        {"name": name, "number": number, **_series(one, standard)}
+        for number, one in zip(numbers, files, strict=True)
+    ]
+
+
+def _series(entry: Entry, standard: int | None) -> dict[str, Any]:
     try:
         rows = read_rows(entry, standard)
-        return {"name": name, "column": rows.value.name, **_file(rows), **_values(rows)}
+        return {"column": rows.value.name, **_file(rows), **_values(rows)}
     except ConfigError as error:
-        return {"name": name, "file": str(entry.value["file"]), "error": str(error)}
+        return {"file": entry.value["file"], "error": str(error)}
 
 
 def _file(rows: Rows) -> dict[str, Any]:
@@ -94,13 +109,13 @@ def data_as_text(facts: Mapping[str, Any]) -> Iterator[str]:
         yield f"  {plain(facts['error'])}"
     if facts["standard_time"] is not None:
         yield f"  standard time: {plain(facts['standard_time'])}"
-    before = ""
+    lines: dict[str, list[str]] = {}
     for one in facts["series"]:
         line = one["file"] if "rows" not in one else _line_of_file(one)
-        if line != before:
-            yield f"  {plain(line)}"
-        before = line
-        yield f"    {plain(_line_of_series(one))}"
+        lines.setdefault(line, []).append(_line_of_series(one))
+    for line, columns in lines.items():
+        yield f"  {plain(line)}"
+        yield from (f"    {plain(one)}" for one in columns)
 
 
 def _line_of_file(one: Mapping[str, Any]) -> str:
@@ -117,10 +132,12 @@ def _line_of_file(one: Mapping[str, Any]) -> str:
 
 
 def _line_of_series(one: Mapping[str, Any]) -> str:
+    number = one.get("number")
+    name = one["name"] if number is None else f"{one['name']}, file number {number}"
     if "rows" not in one:
-        return f"{one['name']}: {one['error']}"
+        return f"{name}: {one['error']}"
     parts = [
-        f"{one['name']}: column {one['column']!r}",
+        f"{name}: column {one['column']!r}",
         "decimal commas" if one["decimal_commas"] else "",
         f"{one['missing']} values missing" if one["missing"] else "",
         f"at most {one['longest_gap']:g} s from value to value" if one["missing"] else "",

@@ -18,7 +18,7 @@ from fmugym.baselines.observer import spread
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.task.future import Future, Lookup
+from fmugym.task.future import Future, Lookup, Span
 
 CALM = np.zeros(24)
 
@@ -54,9 +54,8 @@ def play(env, controller, steps, seed=0):
 
 def lookup(period, times, values):
     """That of a series of its own."""
-    return Lookup(
-        {"wind": np.array([*times, *values, 0.0, values[-1]])}, "wind", 0.0, period, False
-    )
+    table = np.array([*times, *values, 0.0, values[-1]])
+    return Lookup({"wind": table}, "wind", (Span(0.0, period),), False)
 
 
 def mpc(horizon="1h 40min", **arguments):

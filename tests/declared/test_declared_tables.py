@@ -244,7 +244,9 @@ class TestGaps:
     def test_a_gap_among_scattered_empty_cells(self, tmp_path):
         """The rows are regular, although less than nine of ten values are."""
         empty = {*range(0, self.DAYS, 6), *range(100, 110)}
-        with pytest.raises(TaskError, match=r"120 of 672 values of 'p' are missing.*11 hours"):
+        with pytest.raises(
+            TaskError, match=r"120 of 672 values of 'p' of .* are missing.*11 hours"
+        ):
             series(tmp_path, hourly(count=self.DAYS, empty=empty))
 
     def test_at_the_end_of_the_period(self, tmp_path):
