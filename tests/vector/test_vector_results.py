@@ -165,8 +165,7 @@ STARTS = FLAGS, DRAWN, SEEN
 
 @pytest.fixture
 def play():
-    envs = FMUVectorEnv(CartPoleEnv, NUM_ENVS)
-    envs.reset(seed=0)
+    envs = make(CartPoleEnv)
     yield envs.inside.engine._play
     envs.close()
 
