@@ -7,6 +7,7 @@ import sys
 import sysconfig
 from pathlib import Path
 
+import numpy as np
 from setuptools import Extension, setup
 
 from build_backend import OPTIONS, BuildExtension, has_headers
@@ -23,7 +24,7 @@ native = Extension(
         if path.name != "main.c"  # of the worker program, which fmugym.wine builds
     ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
-    include_dirs=["native"],
+    include_dirs=["native", np.get_include()],
     **OPTIONS,
 )
 

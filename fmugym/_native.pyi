@@ -91,6 +91,18 @@ def stop_tracing(process: int, stopped_by: int, /) -> None:
         stopped_by: The number of the signal, which it gets now.
     """
 
+def copy_arrays(targets: tuple[Array, ...], sources: tuple[Array, ...], /) -> None:
+    """Copy arrays of one or two dimensions into others of the same shapes and types.
+
+    Args:
+        targets: The arrays to copy into; the elements of a row have no gaps between them.
+        sources: The arrays to copy, likewise.
+
+    Raises:
+        TypeError: If one is no such array.
+        ValueError: If they differ in number or size, or one cannot be written.
+    """
+
 @final
 class Access:
     """A list of variables of one FMI version.
@@ -207,20 +219,11 @@ class Pool:
         ended: Array,
         kept: Array,
         done: Array | None,
-        observes: bool,
+        results: tuple[Any, ...] | None,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
-    def play(
-        self,
-        actions: Array,
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
-        seen: tuple[Array, ...],
-        starts: tuple[Any, ...] | None,
-        /,
-    ) -> tuple[int, bool, int]:
+    def play(self, actions: Array, at_ends: bool, /) -> tuple[Any, int, bool, Array | None]:
         """Do a step, with all that was taken over; see ``Play.step`` of ``fmugym.pool.base``.
 
         Raises:
@@ -239,23 +242,15 @@ class Pool:
         without paths of libraries.
         """
 
-    def play_after(
-        self,
-        actions: Array,
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
-        seen: tuple[Array, ...],
-        /,
-    ) -> tuple[int, bool, int]:
+    def play_after(self, actions: Array, /) -> tuple[Any, int, bool, None]:
         """Do what comes after the FMUs' part of ``play``.
 
         The outputs and statuses are those that the pool's arrays have. The results and errors are
         those of ``play``.
         """
 
-    def start(self, mask: Array, drawn: Array, seen: tuple[Array, ...], /) -> tuple[int, bool]:
-        """Start episodes; see ``Play.start`` of ``fmugym.pool.base``."""
+    def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
+        """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
 
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""
@@ -286,3 +281,15 @@ class Pool:
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
+
+    def rollout(
+        self,
+        actions: Array,
+        observations: Array | tuple[Array, ...],
+        rewards: Array,
+        terminated: Array,
+        truncated: Array,
+        offsets: Array,
+        /,
+    ) -> int:
+        """Do many steps with all that was taken over; see ``NativePool.roll_out``."""

@@ -33,40 +33,42 @@ StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
 
 
-Played = tuple[int, bool, int]
-"""What a step with programs tells: how many instances had trouble (a status worse than a warning,
-or numbers that are not finite), whether any episode is at its end now, and how many have started
-where others have ended."""
+Played = tuple[Any, int, bool, MaskArray | None]
+"""What a step with programs returns; see ``Play.step``."""
 
 
 class Play(NamedTuple):
-    """A step with programs for which a pool is prepared.
+    """What a pool does that is prepared for a step with programs.
 
     ``before`` and ``after`` surround a step of the FMUs by the caller, who also starts episodes. A
-    pool that steps and starts the FMUs itself has the other functions, too. They fill arrays that
-    the caller has made: rewards, terminated and truncated, each of shape (N,), and a tuple of those
-    of observations and infos.
+    pool that steps and starts the FMUs itself has the other functions, too.
 
     Attributes:
         check: Refuses actions as ``step`` does: by a ``TypeError``, ``ValueError`` or
             ``BufferError``.
         before: Takes the actions, and makes the inputs.
-        after: Takes the same actions and the arrays; returns ``Played``.
-        step: Takes the actions, the arrays, and where episodes may start: None; or a mask of those
-            that have ended before and the memory of drawn values, shape (draws, N); or besides a
-            tuple of arrays like those of observations and infos, which get the last ones of
-            episodes that end without a fault and are followed in the same step. The mask then tells
-            these afterwards. It returns ``Played``.
-        start: Takes a mask of episodes to start, with at least one True, the memory of drawn
-            values, and the tuple of arrays. It returns how many instances had trouble, and whether
-            any episode is at its end now.
+        after: Takes the same actions, and returns what ``step`` returns.
+        step: A function of actions and a flag; it does a step, and starts the episodes that have
+            ended before it. If the flag is True, an episode that ends without a fault is followed
+            by the next one in the same step. It returns the result; how many instances had trouble
+            (a status worse than a warning, or numbers that are not finite); whether any episode is
+            at its end now; and where episodes have started, shape (N,), or None. The infos of the
+            result then tell of these starts. All arrays are new, or those of an earlier step that
+            nobody holds any more.
+        start_and_step: The same; to be called if episodes may start.
+        reset: A function of the options of a reset. If they are a dict of nothing but
+            ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
+            it starts these episodes and returns the result of the reset, how many instances had
+            trouble, and whether any episode is at its end now. Otherwise it does nothing and
+            returns None.
     """
 
     check: Callable[[Any], None]
     before: Callable[[Any], None]
-    after: Callable[..., Played]
-    step: Callable[..., Played] | None = None
-    start: Callable[..., tuple[int, bool]] | None = None
+    after: Callable[[Any], Played]
+    step: Callable[[Any, bool], Played] | None = None
+    start_and_step: Callable[[Any, bool], Played] | None = None
+    reset: Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None] | None = None
 
 
 class Pool(ABC):

@@ -165,16 +165,6 @@ def split_options(options: Any, num_envs: int) -> tuple[dict[str, Any], MaskArra
     return remaining, _checked_mask(remaining.pop("reset_mask", None), num_envs)
 
 
-def only_mask_of(options: Any, num_envs: int) -> MaskArray | None:
-    """A copy of the mask of options that hold nothing else; None if ``split_options`` must look."""
-    if type(options) is not dict or options.keys() != {"reset_mask"}:
-        return None
-    mask = options["reset_mask"]
-    if type(mask) is not np.ndarray or mask.dtype != np.bool_ or mask.shape != (num_envs,):
-        return None
-    return mask.copy() if mask.any() else None
-
-
 def _checked_mask(mask: Any, num_envs: int) -> MaskArray:
     """Copy ``options["reset_mask"]``; None stands for all environments.
 

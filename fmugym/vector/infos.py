@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from math import isfinite
 from operator import getitem
 from typing import Any
@@ -14,7 +15,7 @@ from gymnasium import spaces
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.readings import environments_first
-from fmugym.task.values import LateDict
+from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.codec import coded, mapped, within
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "drawn_info",
     "final_infos",
     "last_observations",
+    "late_info",
     "merged",
     "not_finite",
     "observation_of",
@@ -30,14 +32,21 @@ __all__ = [
 
 
 def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    """The info of episodes that start.
+    """The info of a reset.
 
     Args:
         draws: What the environments in the mask have drawn from.
-        drawn: What they have drawn, shape (draws, N); that of others is not read.
-        mask: The environments. No caller changes it.
+        drawn: What they have drawn, shape (draws, M).
+        mask: The environments that were reset. No caller changes it.
     """
-    return {"drawn": LateDict.of(_told, draws, drawn, mask), "_drawn": mask}  # rarely read
+    of_all = np.zeros((len(drawn), len(mask)))
+    of_all[:, mask] = drawn
+    return {"drawn": LateDict.of(_told, draws, of_all, mask), "_drawn": mask}  # rarely read
+
+
+def late_info(draws: EpisodeDraws) -> tuple[Any, ...]:
+    """How the C extension makes ``"drawn"`` of ``drawn_info`` from drawn values and a mask."""
+    return LateDict, UNFILLED, partial(_told, draws)
 
 
 def _told(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

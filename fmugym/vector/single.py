@@ -11,14 +11,12 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.expressions.program import UncompilableError
-from fmugym.pool.base import Played
 from fmugym.pool.extension import require_refusal
 from fmugym.task.actions import as_element
 from fmugym.task.judging import Result, judged
 from fmugym.task.native_draws import no_draws
 from fmugym.task.saving import READ
-from fmugym.vector.codec import mapped
-from fmugym.vector.engines.layout import Arrays, Layout
+from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.task_programs import TaskPrograms
@@ -69,19 +67,15 @@ class ExpressionStep:
             rows.parameters = {name: row for name, row in numbers if name not in draws.strings}
         self._memory = memory = Memory(env, rows, np.zeros(1, np.bool_))
         memory.hold(task)
-        self._layout = layout = Layout(task, env, 1)
+        shapes, form, self._divided = Layout(task, env, 1).of_one()
         play = memory.prepare(
             pool,
             task,
             starts,
             (no_draws(), (), np.zeros((1, 6), np.uint64)),
             env.inside.step_limit,
-            layout.observes,
+            (tuple, form, (), shapes, (None,) * 3),
         )
-        self._reward = np.empty(1)
-        self._terminated, self._truncated = np.empty(1, np.bool_), np.empty(1, np.bool_)
-        ((_, *shape), self._type), *_ = layout.shapes
-        self._shape = tuple(shape)  # of the only array, if there is no other
         self._play: Any = play.step
         self._updated = task.updated
         self._is_discrete = isinstance(env.action_space, spaces.Discrete)
@@ -104,28 +98,23 @@ class ExpressionStep:
             ConfigError: If the action does not fit, or the inputs that it makes are not finite.
             SimulationError: After a fault with ``on_fault="raise"``.
         """
-        actions, inside, layout = self._array_of(env, action), env.inside, self._layout
-        seen = (np.empty(self._shape, self._type),) if layout.is_plain else layout.new()
+        actions, inside = self._array_of(env, action), env.inside
         inside.ended = True  # until the step is done: after an exception no episode goes on
         try:
-            troubled, ended, _ = self._play(
-                actions, self._reward, self._terminated, self._truncated, seen, None
-            )
+            played = self._play(actions, False)
         except _REFUSALS as error:
             require_refusal(error)
-            troubled, ended, _ = self._play_element(env, action, seen)
+            played = self._play_element(env, action)
+        (seen, rewards, terminated, truncated, info), troubled, _, _ = played
         if troubled:
             return self._judge_again(env)
-        if ended:
+        if terminated or truncated:
             self._memory.ended[0] = False  # a reset begins the next episode, not the pool
         else:
             inside.ended = False
-        observation, info = seen[0], {}
-        if not layout.is_plain:
-            parts = mapped(_first, layout.nested(seen))
-            observation, info = parts["observation"], parts["info"]
-        reward, terminated = self._reward.item(), self._terminated.item()
-        return observation, reward, terminated, self._truncated.item(), info
+        if self._divided is not None:
+            seen, info = self._divided(seen)
+        return seen, rewards.item(), terminated.item(), truncated.item(), info
 
     def _array_of(self, env: FMUEnv, action: Any) -> npt.NDArray[Any]:
         """The action of the only environment in an array."""
@@ -136,15 +125,12 @@ class ExpressionStep:
             return action[np.newaxis]
         return as_element(env, action)[np.newaxis]
 
-    def _play_element(self, env: FMUEnv, action: Any, seen: Arrays) -> Played:
+    def _play_element(self, env: FMUEnv, action: Any) -> Any:
         """Do a step with an action that the pool has refused in its own type or shape."""
         env.inside.ended = False
         actions = as_element(env, action)[np.newaxis]
         env.inside.ended = True
-        played: Played = self._play(
-            actions, self._reward, self._terminated, self._truncated, seen, None
-        )
-        return played
+        return self._play(actions, False)
 
     def _judge_again(self, env: FMUEnv) -> Result:
         """Judge a step in Python, whose status or a number is not good, from before it on."""
@@ -162,8 +148,3 @@ class ExpressionStep:
         result = judged(env, inside.pool.statuses.item(0), values)
         inside.ended = result[2] or result[3]
         return result
-
-
-def _first(array: npt.NDArray[Any]) -> Any:
-    """The part of the only environment; a number if it has no axis."""
-    return array[0].copy() if array.ndim > 1 else array.item()

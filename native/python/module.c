@@ -2,6 +2,7 @@
 
 #include <string.h>
 
+#include "arrays.h"
 #include "handlers.h"
 #include "programs.h"
 
@@ -58,6 +59,7 @@ static PyMethodDef functions[] = {
     {"serve", py_serve, METH_VARARGS, NULL},
     {"end_with", py_end_with, METH_O, NULL},
     {"stop_tracing", py_stop_tracing, METH_VARARGS, NULL},
+    {"copy_arrays", py_copy_arrays, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -20,6 +20,7 @@ static void playing_free(Playing *playing) {
     release_rows(&playing->rows);
     Py_XDECREF(playing->start);
     Py_XDECREF(playing->draws);
+    results_free(playing->results);
     free(playing);
 }
 
@@ -65,20 +66,20 @@ typedef struct {
     const char *form;
     Py_ssize_t size;
     PyObject *rows, *start, *start_values, *shape, *current, *previous, *draws, *states;
-    PyObject *step_counts, *ended, *kept, *done;
-    int letter, observes;
+    PyObject *step_counts, *ended, *kept, *done, *results;
+    int letter;
 } Parts;
 
 static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
     static char *names[] = {"form",        "rows",     "start", "start_values", "shape",
                             "letter",      "current",  "previous", "draws",     "states",
-                            "step_counts", "ended",    "kept",  "done",         "observes", NULL};
+                            "step_counts", "ended",    "kept",  "done",         "results", NULL};
 
     return PyArg_ParseTupleAndKeywords(
-        args, kwargs, "$y#O!OOO!COOOOOOOOp:prepare_play", names, &p->form, &p->size, &PyTuple_Type,
+        args, kwargs, "$y#O!OOO!COOOOOOOOO:prepare_play", names, &p->form, &p->size, &PyTuple_Type,
         &p->rows, &p->start, &p->start_values, &PyTuple_Type, &p->shape, &p->letter, &p->current,
         &p->previous, &p->draws, &p->states, &p->step_counts, &p->ended, &p->kept, &p->done,
-        &p->observes);
+        &p->results);
 }
 
 static bool take_form(PyPool *self, Playing *playing, const Parts *p) {
@@ -166,13 +167,41 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
     return true;
 }
 
-static bool take_observing(Playing *playing, bool observes) {
-    playing->observes = observes;
-    if (observes && playing->form.judgement.program.number_of_seen > 0) {
-        PyErr_SetString(PyExc_ValueError, "the pool and a program make observations");
+bool pool_observes(const Playing *playing) {
+    return playing->form.judgement.program.number_of_seen == 0 && playing->results != NULL &&
+           results_number_of_seen(playing->results) == 1;
+}
+
+static bool results_fit(const PyPool *self, const Playing *playing) {
+    const Settings *s = &self->pool.settings;
+    const Results *r = playing->results;
+    const size_t seen = playing->form.judgement.program.number_of_seen;
+    bool fit = results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
+               results_size(r, TERMINATED_ARRAY) == s->count &&
+               results_size(r, TRUNCATED_ARRAY) == s->count &&
+               results_size(r, MASK_ARRAY) == s->count &&
+               results_size(r, DRAWN_ARRAY) ==
+                   playing->form.play.draws->count * s->count * sizeof(double);
+
+    if (pool_observes(playing)) {
+        return fit && results_size(r, 0) == s->count * s->num_observed * sizeof(float);
+    }
+    for (size_t i = 0; i < seen && fit; i++) {
+        fit = results_size(r, i) == s->count * playing->form.judgement.seen_sizes[i];
+    }
+    return fit && results_number_of_seen(r) == seen;
+}
+
+static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
+    if (parts == Py_None) {
+        return true;
+    }
+    playing->results = results_take(parts);
+    if (playing->results != NULL && !results_fit(self, playing)) {
+        PyErr_SetString(PyExc_ValueError, "the arrays of results do not fit the pool");
         return false;
     }
-    return true;
+    return playing->results != NULL;
 }
 
 /* What comes later refers to what comes first. */
@@ -182,7 +211,7 @@ static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwarg
     return parse(args, kwargs, &p) && take_starts(self, playing, p.start, p.start_values) &&
            take_draws(self, playing, p.draws, p.states) && take_form(self, playing, &p) &&
            take_actions(self, playing, &p) && take_arrays(self, playing, &p) &&
-           take_observing(playing, p.observes);
+           take_results(self, playing, p.results);
 }
 
 /* Always discards the previous preparation. A call that uses it keeps its own reference. */

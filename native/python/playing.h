@@ -5,7 +5,7 @@
 
 #include "play_form.h"
 #include "programs.h"
-#include "python.h"
+#include "results.h"
 
 enum {
     STARTS,
@@ -28,32 +28,31 @@ typedef struct {
     Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;
-    bool observes; /* whether the pool itself fills the observations, instead of the program */
+    Results *results; /* NULL if only rollouts follow */
 } Playing;
 
 /* Of a capsule that prepare_play has made. */
 Playing *playing_of(PyObject *capsule);
 
-/* How many arrays of observations and infos a step fills. */
-size_t number_of_seen(const Playing *playing);
+/* Whether the pool itself fills the observations, instead of the program. */
+bool pool_observes(const Playing *playing);
 
 /* One call that plays: */
 
 enum {
     ACTIONS,
+    SEEN,
     REWARDS,
     TERMINATED,
     TRUNCATED,
-    MASK,
-    DRAWN,
     TURN_BUFFERS
 };
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];
-    Py_buffer seen_buffers[MOST_SEEN], last_buffers[MOST_SEEN];
-    char *seen[MOST_SEEN], *last[MOST_SEEN];
-    bool starts_at_ends; /* whether episodes start where others end */
+    Py_buffer seen_buffers[MOST_SEEN];
+    char *seen[MOST_SEEN];
+    size_t seen_sizes[MOST_SEEN];
     Turn turn;
     Call call;
     bool bad_action;
@@ -72,19 +71,16 @@ bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer 
 void clear_turn(const Playing *playing, PyTurn *t);
 void release_turn(const Playing *playing, PyTurn *t);
 
-/* Take the arrays of observations and infos; the mask and the drawn values of episodes that start. */
-bool take_seen_arrays(PyPool *self, const Playing *playing, PyObject *arrays, Py_buffer *buffers,
-               char **seen);
-bool take_start(const PyPool *self, const Playing *playing, PyObject *mask, PyObject *drawn,
-                PyTurn *t);
-
 /* Lets the turn and its call refer to the buffers. */
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t);
+/* Lets the step fill the arrays that it returns. */
+void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t);
 
 /* Whether a hook looked up an index outside of a table, which is an exception. */
 bool is_outside(const PyTurn *t);
 
-/* Returns false with an exception if nothing is prepared. */
+/* Both return false with an exception if nothing is prepared, or only rollouts. */
 bool is_prepared(const PyPool *self);
+bool has_results(const PyPool *self);
 
 #endif

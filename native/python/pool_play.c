@@ -45,65 +45,6 @@ bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer 
     return true;
 }
 
-/* The arrays of observations and infos, whose memory a step or a start fills. */
-bool take_seen_arrays(PyPool *self, const Playing *playing, PyObject *arrays, Py_buffer *buffers,
-               char **seen) {
-    const Settings *s = &self->pool.settings;
-    const size_t count = number_of_seen(playing);
-
-    if (!PyTuple_Check(arrays) || (size_t)PyTuple_Size(arrays) != count) {
-        PyErr_Format(PyExc_TypeError, "expected a tuple of %zu arrays", count);
-        return false;
-    }
-    for (size_t i = 0; i < count; i++) {
-        const size_t size = playing->observes ? s->num_observed * sizeof(float)
-                                              : playing->form.judgement.seen_sizes[i];
-        if (!take_bytes(PyTuple_GetItem(arrays, (Py_ssize_t)i), &buffers[i], PyBUF_WRITABLE,
-                        s->count * size)) {
-            return false;
-        }
-        seen[i] = buffers[i].buf;
-    }
-    return true;
-}
-
-bool take_start(const PyPool *self, const Playing *playing, PyObject *mask, PyObject *drawn,
-                PyTurn *t) {
-    const size_t count = self->pool.settings.count;
-
-    return take_bytes(mask, &t->buffers[MASK], PyBUF_WRITABLE, count) &&
-           take_bytes(drawn, &t->buffers[DRAWN], PyBUF_WRITABLE,
-                      playing->form.play.draws->count * count * sizeof(double));
-}
-
-/* Rewards, terminated, truncated, and the arrays of observations and infos. */
-static bool take_judged(PyPool *self, const Playing *playing, PyObject *const *arrays, PyTurn *t) {
-    const size_t count = self->pool.settings.count;
-
-    return take_bytes(arrays[0], &t->buffers[REWARDS], PyBUF_WRITABLE, count * sizeof(double)) &&
-           take_bytes(arrays[1], &t->buffers[TERMINATED], PyBUF_WRITABLE, count) &&
-           take_bytes(arrays[2], &t->buffers[TRUNCATED], PyBUF_WRITABLE, count) &&
-           take_seen_arrays(self, playing, arrays[3], t->seen_buffers, t->seen);
-}
-
-/* None if no episode may start; a mask and the drawn values; and a tuple of arrays like those of
- * observations and infos, for the last ones, if episodes start where others end. */
-static bool take_starts_of_step(PyPool *self, const Playing *playing, PyObject *starts,
-                                PyTurn *t) {
-    if (starts == Py_None) {
-        return true;
-    }
-    const Py_ssize_t size = PyTuple_Check(starts) ? PyTuple_Size(starts) : 0;
-    if (size != 2 && size != 3) {
-        PyErr_SetString(PyExc_TypeError, "expected a tuple of two or three for the starts");
-        return false;
-    }
-    t->starts_at_ends = size == 3;
-    return take_start(self, playing, PyTuple_GetItem(starts, 0), PyTuple_GetItem(starts, 1), t) &&
-           (size == 2 ||
-            take_seen_arrays(self, playing, PyTuple_GetItem(starts, 2), t->last_buffers, t->last));
-}
-
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
     const Py_buffer *b = t->buffers;
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
@@ -115,22 +56,16 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .terminated = b[TERMINATED].buf,
         .truncated = b[TRUNCATED].buf,
         .seen = t->seen,
-        .seen_sizes = playing->form.judgement.seen_sizes,
-        .drawn = b[DRAWN].buf,
+        .seen_sizes = t->seen_sizes,
     };
     t->call = (Call){
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
         .start = &((PyAccess *)playing->start)->access,
         .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
         .mask = {(const char *)playing->form.play.ended, 1},
-        .observations = playing->observes ? (float *)(void *)t->seen[0] : NULL,
+        .observations = b[SEEN].buf,
         .turn = &t->turn,
     };
-    if (t->starts_at_ends) {
-        t->turn.started = b[MASK].buf;
-        t->turn.last_seen = t->last;
-        t->turn.last_observations = playing->observes ? (float *)(void *)t->last[0] : NULL;
-    }
 }
 
 static void do_play(PyPool *self, bool alone, void *context) {
@@ -168,6 +103,53 @@ bool is_outside(const PyTurn *t) {
     return t->ends.outside;
 }
 
+void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+    t->turn.rewards = (double *)(void *)arrays->memory[REWARDS_ARRAY];
+    t->turn.terminated = (uint8_t *)arrays->memory[TERMINATED_ARRAY];
+    t->turn.truncated = (uint8_t *)arrays->memory[TRUNCATED_ARRAY];
+    t->turn.seen = arrays->memory;
+    if (pool_observes(playing)) {
+        t->call.observations = (float *)(void *)arrays->memory[0];
+    }
+}
+
+/* Lets episodes start where others have ended before this step. */
+static void settle_starts(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
+    memcpy(arrays->memory[MASK_ARRAY], playing->form.play.ended, playing->form.play.count);
+}
+
+/* Lets them also start where others end in this step. */
+static void settle_starts_at_ends(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+    t->turn.last_seen = arrays->last_memory;
+    if (pool_observes(playing)) {
+        t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
+    }
+    t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
+    for (size_t i = 0; i < playing->form.judgement.program.number_of_seen; i++) {
+        t->seen_sizes[i] = playing->form.judgement.seen_sizes[i];
+    }
+}
+
+/* The result, how many instances had trouble, whether any episode is at its end now, and None or
+ * where episodes have started. */
+static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
+    const bool at_ends = t->turn.started != NULL;
+    const bool any_started = at_ends ? t->ends.started > 0 : t->turn.drawn != NULL;
+    PyObject *result = results_of_step(playing->results, arrays, any_started, at_ends);
+    PyObject *tuple = result == NULL ? NULL : PyTuple_New(4);
+
+    if (tuple == NULL) {
+        Py_XDECREF(result);
+        return NULL;
+    }
+    PyTuple_SetItem(tuple, 0, result);
+    PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
+    PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended > t->ends.started));
+    PyTuple_SetItem(tuple, 3, Py_NewRef(any_started ? arrays->arrays[MASK_ARRAY] : Py_None));
+    return tuple;
+}
+
 static void raise_bad_action(void) {
     PyErr_SetString(PyExc_ValueError, "an action is out of range");
 }
@@ -186,41 +168,76 @@ static bool play_turn(PyPool *self, int operation, PyTurn *t) {
     return !is_outside(t) && report_messages(self);
 }
 
-size_t number_of_seen(const Playing *playing) {
-    return playing->observes ? 1 : playing->form.judgement.program.number_of_seen;
-}
-
 void clear_turn(const Playing *playing, PyTurn *t) {
-    const size_t size = number_of_seen(playing) * sizeof(Py_buffer);
+    const size_t size = playing->form.judgement.program.number_of_seen * sizeof(Py_buffer);
 
-    t->bad_action = t->starts_at_ends = false;
-    t->seen[0] = NULL;
+    t->bad_action = false;
     memset(t->buffers, 0, sizeof t->buffers);
     memset(t->seen_buffers, 0, size);
-    memset(t->last_buffers, 0, size);
 }
 
 void release_turn(const Playing *playing, PyTurn *t) {
     for (int i = 0; i < TURN_BUFFERS; i++) {
         release_buffer(&t->buffers[i]);
     }
-    for (size_t i = 0; i < number_of_seen(playing); i++) {
+    for (size_t i = 0; i < playing->form.judgement.program.number_of_seen; i++) {
         release_buffer(&t->seen_buffers[i]);
-        release_buffer(&t->last_buffers[i]);
     }
 }
 
-/* How many instances had trouble, whether any episode is at its end now, and how many have started
- * where others have ended. */
-static PyObject *told_of(const PyTurn *t) {
-    PyObject *tuple = PyTuple_New(3);
+/* What comes before the FMUs' part fills nothing that it returns. */
+static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *actions) {
+    const Playing *playing = playing_of(capsule);
+    PyTurn t;
+    bool done = false;
 
-    if (tuple != NULL) {
-        PyTuple_SetItem(tuple, 0, PyLong_FromSize_t(t->troubled));
-        PyTuple_SetItem(tuple, 1, PyBool_FromLong(t->ends.ended > t->ends.started));
-        PyTuple_SetItem(tuple, 2, PyLong_FromSize_t(t->ends.started));
+    clear_turn(playing, &t);
+    if (take_array_of_actions(playing, actions, &t.buffers[ACTIONS])) {
+        settle_turn(self, playing, &t);
+        done = play_turn(self, BEFORE, &t);
     }
-    return tuple;
+    release_turn(playing, &t);
+    return done ? Py_NewRef(Py_None) : NULL;
+}
+
+static bool provide(Results *results, bool starts, bool at_ends, ResultArrays *arrays) {
+    return results_provide_step(results, arrays) &&
+           (!starts || results_provide_starts(results, at_ends, arrays));
+}
+
+static void settle_step(PyPool *self, const Playing *playing, bool starts, bool at_ends,
+                        const ResultArrays *arrays, PyTurn *t) {
+    settle_turn(self, playing, t);
+    settle_results(playing, arrays, t);
+    if (starts) {
+        settle_starts(playing, arrays, t);
+    }
+    if (at_ends) {
+        settle_starts_at_ends(playing, arrays, t);
+    }
+}
+
+/* Reads where episodes have ended before it enters the pool. Those that another thread ends in between
+ * start with the values of earlier draws. */
+static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *actions,
+                           bool at_ends) {
+    const Playing *playing = playing_of(capsule);
+    const Play *play = &playing->form.play;
+    const bool starts =
+        operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
+    ResultArrays arrays;
+    PyTurn t;
+    PyObject *result = NULL;
+
+    clear_turn(playing, &t);
+    if (provide(playing->results, starts, at_ends, &arrays) &&
+        take_array_of_actions(playing, actions, &t.buffers[ACTIONS])) {
+        settle_step(self, playing, starts, at_ends, &arrays, &t);
+        result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
+    }
+    results_drop(playing->results, &arrays);
+    release_turn(playing, &t);
+    return result;
 }
 
 bool is_prepared(const PyPool *self) {
@@ -230,53 +247,28 @@ bool is_prepared(const PyPool *self) {
     return self->playing != NULL;
 }
 
-/* The arguments of a step: the actions, what take_judged takes, and what take_starts_of_step does. */
-enum { GIVEN_ACTIONS, GIVEN_ARRAYS, GIVEN_STARTS = GIVEN_ARRAYS + 4, GIVEN };
+bool has_results(const PyPool *self) {
+    const Playing *playing = playing_of(self->playing);
 
-/* Takes so many of these arguments, and does a part of a step, or all of it. */
-static PyObject *play_with(PyPool *self, int operation, const Playing *playing,
-                           PyObject *const *args, Py_ssize_t count) {
-    PyTurn t;
-    PyObject *result = NULL;
-
-    clear_turn(playing, &t);
-    if (take_array_of_actions(playing, args[GIVEN_ACTIONS], &t.buffers[ACTIONS]) &&
-        (count <= GIVEN_ARRAYS || take_judged(self, playing, args + GIVEN_ARRAYS, &t)) &&
-        (count <= GIVEN_STARTS ||
-         take_starts_of_step(self, playing, args[GIVEN_STARTS], &t))) {
-        settle_turn(self, playing, &t);
-        if (play_turn(self, operation, &t)) {
-            result = count > GIVEN_ARRAYS ? told_of(&t) : Py_NewRef(Py_None);
-        }
+    if (playing->results == NULL) {
+        PyErr_SetString(PyExc_ValueError, "play was prepared without results");
     }
-    release_turn(playing, &t);
-    return result;
+    return playing->results != NULL;
 }
 
 /* Keeps what was prepared alive while it plays. */
-static PyObject *play_by(PyObject *object, int operation, PyObject *const *args,
-                         Py_ssize_t count) {
+static PyObject *play_by(PyObject *object, int operation, PyObject *actions, bool at_ends) {
     PyPool *self = (PyPool *)object;
 
-    if (!is_prepared(self)) {
+    if (!is_prepared(self) || !has_results(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = play_with(self, operation, playing_of(playing), args, count);
+    PyObject *result = operation == BEFORE
+                           ? play_before_with(self, playing, actions)
+                           : play_with(self, operation, playing, actions, at_ends);
     Py_DECREF(playing);
     return result;
-}
-
-PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return has_arguments(nargs, GIVEN) ? play_by(object, PLAY, args, nargs) : NULL;
-}
-
-PyObject *py_play_before(PyObject *object, PyObject *actions) {
-    return play_by(object, BEFORE, &actions, 1);
-}
-
-PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return has_arguments(nargs, GIVEN_STARTS) ? play_by(object, AFTER, args, nargs) : NULL;
 }
 
 /* Nothing but the check of the actions that every step begins with. */
@@ -301,4 +293,16 @@ PyObject *py_check_actions(PyObject *object, PyObject *actions) {
     release_turn(playing, &t);
     Py_DECREF(capsule);
     return good ? Py_NewRef(Py_None) : NULL;
+}
+
+PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return has_arguments(nargs, 2) ? play_by(object, PLAY, args[0], args[1] == Py_True) : NULL;
+}
+
+PyObject *py_play_before(PyObject *object, PyObject *actions) {
+    return play_by(object, BEFORE, actions, false);
+}
+
+PyObject *py_play_after(PyObject *object, PyObject *actions) {
+    return play_by(object, AFTER, actions, false);
 }

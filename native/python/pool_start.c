@@ -15,33 +15,82 @@ static void do_start(PyPool *self, bool alone, void *context) {
     t->ends.ended = memchr(play->ended, 1, play->count) != NULL;
 }
 
-/* The arguments: a mask, the memory of the drawn values, and the arrays of observations and infos. */
-static PyObject *start_with(PyPool *self, const Playing *playing, PyObject *const *args) {
+/* The mask of a dict that holds nothing else, borrowed; NULL, maybe with an exception, if there is
+ * none. */
+static PyObject *mask_of(PyObject *options) {
+    static PyObject *name; /* of this process: other interpreters cannot load this extension */
+
+    if (!PyDict_CheckExact(options) || PyDict_Size(options) != 1) {
+        return NULL;
+    }
+    if (name == NULL) {
+        name = PyUnicode_InternFromString("reset_mask");
+    }
+    return name == NULL ? NULL : PyDict_GetItemWithError(options, name);
+}
+
+static void settle_reset(PyPool *self, const Playing *playing, const ResultArrays *arrays,
+                         PyTurn *t) {
+    settle_turn(self, playing, t);
+    t->call.mask = (Mask){arrays->memory[MASK_ARRAY], 1};
+    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
+    t->turn.seen = arrays->memory;
+    if (pool_observes(playing)) {
+        t->call.observations = (float *)(void *)arrays->memory[0];
+    }
+}
+
+static PyObject *reset_result(const Playing *playing, const ResultArrays *arrays,
+                              const PyTurn *t) {
+    PyObject *result = results_of_reset(playing->results, arrays);
+    PyObject *tuple = result == NULL ? NULL : PyTuple_New(3);
+
+    if (tuple == NULL) {
+        Py_XDECREF(result);
+        return NULL;
+    }
+    PyTuple_SetItem(tuple, 0, result);
+    PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
+    PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended != 0));
+    return tuple;
+}
+
+/* The memory is provided first: that may run code that changes the caller's mask. */
+static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
+    const Playing *playing = playing_of(capsule);
+    ResultArrays arrays;
     PyTurn t;
     PyObject *result = NULL;
 
     clear_turn(playing, &t);
-    if (take_start(self, playing, args[0], args[1], &t) &&
-        take_seen_arrays(self, playing, args[2], t.seen_buffers, t.seen)) {
-        settle_turn(self, playing, &t);
-        t.call.mask = (Mask){t.buffers[MASK].buf, 1};
-        if (perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self)) {
-            result = Py_BuildValue("nO", (Py_ssize_t)t.troubled,
-                                   t.ends.ended != 0 ? Py_True : Py_False);
+    if (results_provide_reset(playing->results, &arrays)) {
+        if (!results_copy_mask(playing->results, mask, &arrays)) {
+            result = Py_NewRef(Py_None);
+        } else {
+            settle_reset(self, playing, &arrays, &t);
+            if (perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self)) {
+                result = reset_result(playing, &arrays, &t);
+            }
         }
     }
-    release_turn(playing, &t);
+    results_drop(playing->results, &arrays);
     return result;
 }
 
-PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+PyObject *py_reset_by(PyObject *object, PyObject *options) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, 3) || !is_prepared(self)) {
+    if (!is_prepared(self) || !has_results(self)) {
         return NULL;
     }
+    PyObject *mask = mask_of(options);
+    if (mask == NULL) {
+        return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+    }
+    Py_INCREF(mask);
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = start_with(self, playing_of(playing), args);
+    PyObject *result = reset_by(self, playing, mask);
     Py_DECREF(playing);
+    Py_DECREF(mask);
     return result;
 }

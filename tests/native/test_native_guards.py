@@ -214,7 +214,7 @@ def surroundings(pool):
         "drawn_variables": (),
         "variable_starts": (),
         "input_starts": ((-1, 0.0),) * len(pool.inputs),
-        "observes": False,
+        "results": None,
     }
 
 

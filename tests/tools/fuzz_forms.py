@@ -231,7 +231,7 @@ def play_of(inputs, outputs):
         "drawn_variables": (),
         "variable_starts": ((variables[0], np.float64(2.0).tobytes()),),
         "input_starts": ((-1, 0.5),),
-        "observes": False,
+        "results": None,
     }
     actions = {
         "shape": (),

@@ -38,6 +38,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
+from fmugym.task.values import UNFILLED, LateDict
 
 THREADS = 6
 LONGEST_WAIT = 120.0
@@ -71,6 +72,11 @@ def programs(pool, variables):
 
 
 DRAWS = uniform_draws(0)
+
+
+def tell(drawn, mask):
+    """What a reset tells of the episodes that it starts."""
+    return {"drawn": drawn * mask}
 
 
 class ReceiverError(Exception):
@@ -164,13 +170,14 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "observes": True,
+                "results": (tuple, 0, (), self.results(), (LateDict, UNFILLED, tell)),
             },
         )
 
-    def seen(self):
-        """An array of observations."""
-        return (np.empty((self.n, len(self.outputs)), np.float32),)
+    def results(self):
+        """The shapes and types of what a step or a reset returns."""
+        flags, seen = ((self.n,), bool), ((self.n, len(self.outputs)), np.float32)
+        return seen, ((self.n,), float), flags, flags, flags, ((1, self.n), float)
 
     def draw(self):
         """Seed streams and draw from them while other threads play."""
@@ -181,16 +188,20 @@ class Subject:
 
     def play(self):
         actions = self.rng.integers(0, 2, self.n)
-        judged = np.empty(self.n), np.empty(self.n, bool), np.empty(self.n, bool), self.seen()
-        starts = np.empty(self.n, bool), np.empty((1, self.n)), self.seen()
-        starts = (None, starts[:2], starts)[int(self.rng.integers(3))]
+        at_ends = bool(self.rng.random() < 0.5)  # episodes start in the step that ends others
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            self.pool._pool.play(actions, *judged, starts)
+            result = self.pool._pool.play(actions, at_ends)[0]
             counts["played"] += 1
+            if self.rng.random() < 0.5:
+                self.ends = result[4].get("final_obs")
 
-    def start_episodes(self):
+    def reset_by(self):
+        """Hold what some resets return, and read it later."""
         with contextlib.suppress(ValueError):  # as above
-            self.pool._pool.start(self.mask(), np.empty((1, self.n)), self.seen())
+            result = self.pool._pool.reset_by({"reset_mask": self.mask()})
+            if result is not None and self.rng.random() < 0.5:
+                self.held = result
+                assert self.held[0][1]["drawn"]["drawn"].shape == (1, self.n)
 
     def save(self):
         self.snapshot = self.pool.save()
@@ -217,6 +228,16 @@ class Subject:
     def write(self):
         self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))
 
+    def roll_out(self):
+        horizon = int(self.rng.integers(1, 6))
+        shape = horizon, self.n
+        flags = np.empty(shape, np.bool_), np.empty(shape, np.bool_)
+        observations = np.empty((*shape, len(self.outputs)), np.float32)
+        actions = self.rng.integers(0, 2, shape)
+        with contextlib.suppress(ValueError):  # there may be nothing prepared
+            self.pool.roll_out(actions, observations, np.empty(shape), *flags, np.empty(0))
+            counts["rolled out"] += 1
+
     def forget(self):
         self.snapshot = None
 
@@ -240,7 +261,7 @@ ACTIONS = (
         "play",
         "play",
         "play",
-        "start_episodes",
+        "reset_by",
         "save",
         "restore",
         "forget",
@@ -249,7 +270,7 @@ ACTIONS = (
         "health",
     ),
     "close",
-    *("bundle", "unbundle", "unbundle", "write"),
+    *("bundle", "unbundle", "unbundle", "write", "roll_out", "roll_out"),
 )
 
 

@@ -296,8 +296,8 @@ def with_failing(task, monkeypatch):
 
     def prepared(*parts):
         play = prepare(*parts)
-        made_of.append(Failing(play.step))
-        return play._replace(step=made_of[-1])
+        made_of.append(Failing(play.start_and_step))
+        return play._replace(start_and_step=made_of[-1])
 
     monkeypatch.setattr(envs.inside.pool, "prepare_play", prepared)
     envs.inside.engine._prepare(envs.inside.engine._task)

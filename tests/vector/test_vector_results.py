@@ -1,5 +1,7 @@
 """The arrays that compiled steps return belong to the caller, also where memory is used again."""
 
+import contextlib
+import functools
 import gc
 import pickle
 import weakref
@@ -13,7 +15,7 @@ from vector_tools import CART_POLE, Drawing, grow, protect, reshape, retype, sam
 from ways import in_way
 
 from fmugym import FMUVectorEnv
-from fmugym.envs import CartPoleEnv
+from fmugym.task.values import UNFILLED, LateDict
 
 NUM_ENVS, STEPS = 3, 40
 
@@ -158,57 +160,58 @@ def test_arrays_may_have_many_dimensions():
         np.testing.assert_array_equal(deep[0].reshape(NUM_ENVS, 2), flat[0])
 
 
-REWARDS, FLAGS, SEEN = np.zeros(3), np.zeros(3, bool), (np.zeros((3, 4), np.float32),)
-DRAWN, WRONG = np.zeros((4, 3)), np.zeros(5)
-STARTS = FLAGS, DRAWN, SEEN
+SEEN, REAL, FLAGS, DRAWN = ((3, 4), np.float32), ((3,), float), ((3,), bool), ((4, 3), float)
+ARRAYS = SEEN, REAL, FLAGS, FLAGS, FLAGS, DRAWN
+LATE = LateDict, UNFILLED, dict
 
 
-@pytest.fixture
-def play():
-    envs = make(CartPoleEnv)
-    yield envs.inside.engine._play
-    envs.close()
+FITTING = {"kind": tuple, "seen": 0, "infos": (), "arrays": ARRAYS, "late": LATE}
 
 
-def test_arrays_that_fit_are_filled(play):
-    for starts in (None, STARTS[:2], STARTS):
-        assert play.step(np.zeros(3, np.int64), REWARDS, FLAGS, FLAGS, SEEN, starts)[0] == 0
-        assert REWARDS.all()
-        assert SEEN[0].any()
-    assert play.start(~np.zeros(3, bool), DRAWN, SEEN) == (0, False)
-
-
-def read_only(array):
-    array.setflags(write=False)
-    return array
+def test_results_that_fit_are_taken(monkeypatch):
+    require_refused(tuple(FITTING.values()), monkeypatch, refused=False)
 
 
 @pytest.mark.parametrize(
-    "given",
+    "changes",
     [
-        (WRONG, FLAGS, FLAGS, SEEN, None),
-        (REWARDS, WRONG, FLAGS, SEEN, None),
-        (REWARDS, FLAGS, WRONG, SEEN, None),
-        (REWARDS, FLAGS, FLAGS, (), None),
-        (REWARDS, FLAGS, FLAGS, (WRONG,), None),
-        (REWARDS, FLAGS, FLAGS, SEEN * 2, None),
-        (REWARDS, FLAGS, FLAGS, list(SEEN), None),
-        (REWARDS, FLAGS, FLAGS, (None,), None),
-        (read_only(np.zeros(3)), FLAGS, FLAGS, SEEN, None),
-        (np.zeros(6)[::2], FLAGS, FLAGS, SEEN, None),
-        *((REWARDS, FLAGS, FLAGS, SEEN, starts) for starts in [(), STARTS[:1], 7, STARTS * 2]),
-        (REWARDS, FLAGS, FLAGS, SEEN, (WRONG, DRAWN)),
-        (REWARDS, FLAGS, FLAGS, SEEN, (FLAGS, WRONG)),
-        (REWARDS, FLAGS, FLAGS, SEEN, (FLAGS, DRAWN, (WRONG,))),
+        {"arrays": ()},
+        {"arrays": ARRAYS[:-1]},
+        {"arrays": ARRAYS[:3]},
+        {"arrays": (((3, 5), np.float32), *ARRAYS[1:])},
+        {"arrays": (SEEN, ((3,), np.float32), *ARRAYS[2:])},
+        {"arrays": (*ARRAYS[:-2], ((4,), bool), DRAWN)},
+        {"arrays": (*ARRAYS[:-1], ((5, 3), float))},
+        {"arrays": 7},
+        {"seen": (("a", 0), ("b", 1))},
+        {"seen": 9},
+        {"seen": None},
+        {"seen": functools.reduce(lambda form, _: (("a", form),), range(999), 0)},
+        {"kind": dict},
+        {"infos": 0},
+        {"infos": (("a", 1),)},
+        {"infos": (("a",),)},
+        {"infos": ("ab",)},
+        {"late": LATE[:2]},
+        {"late": dict},
     ],
-    ids=str,
 )
-def test_arrays_that_do_not_fit_are_refused(given, play):
-    with pytest.raises((TypeError, ValueError, BufferError)):
-        play.step(np.zeros(3, np.int64), *given)
+def test_results_that_do_not_fit_are_refused(changes, monkeypatch):
+    require_refused(tuple((FITTING | changes).values()), monkeypatch)
 
 
-@pytest.mark.parametrize("given", [(WRONG, DRAWN, SEEN), (FLAGS, WRONG, SEEN), (FLAGS, DRAWN, ())])
-def test_arrays_of_a_start_that_do_not_fit_are_refused(given, play):
-    with pytest.raises((TypeError, ValueError)):
-        play.start(*given)
+def test_results_that_are_incomplete_are_refused(monkeypatch):
+    require_refused(tuple(FITTING.values())[:-1], monkeypatch)
+
+
+def require_refused(results, monkeypatch, *, refused=True):
+    envs = make(CART_POLE)
+    prepare = envs.inside.pool.prepare_play
+
+    def with_others(*parts):
+        return prepare(*parts[:-1], parts[-1] | {"results": results})
+
+    monkeypatch.setattr(envs.inside.pool, "prepare_play", with_others)
+    with pytest.raises((TypeError, ValueError)) if refused else contextlib.nullcontext():
+        envs.inside.engine._prepare(envs.inside.engine._task)
+    envs.close()

@@ -112,6 +112,9 @@ class Copies:
     """
 
     def __init__(self, arrays: Arrays, block: slice, memory: Memory) -> None:
+        from fmugym._native import copy_arrays  # which is not there on every machine
+
+        self._copy = copy_arrays
         own = memory.arrays._asdict()
         blocks = {
             "inputs": arrays.inputs[:, block],
@@ -132,25 +135,20 @@ class Copies:
 
     def give(self) -> None:
         """Copy what the worker may read or change."""
-        _copy(*self._pairs)
+        self._copy(*self._pairs)
 
     def give_for_step(self) -> None:
         """Copy what the worker reads in a step; it writes all the rest."""
-        _copy(*self._for_step)
+        self._copy(*self._for_step)
 
     def take(self) -> None:
         """Copy what the worker may have changed."""
         shared, blocks = self._pairs
-        _copy(blocks, shared)
+        self._copy(blocks, shared)
 
     def take_counts(self) -> None:
         """Copy the counts."""
-        _copy(*self._counts)
-
-
-def _copy(targets: tuple[Any, ...], sources: tuple[Any, ...]) -> None:
-    for target, source in zip(targets, sources, strict=True):
-        np.copyto(target, source)
+        self._copy(*self._counts)
 
 
 def _anonymous_file(size: int) -> int:

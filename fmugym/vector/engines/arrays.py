@@ -17,10 +17,8 @@ from fmugym.task.readings import environments_last
 from fmugym.task.step import ORDER, conclude
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.engine import StepResult, failed_in
-from fmugym.vector.engines.layout import Arrays
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import drawn_info
 
 __all__ = ["ArrayEngine"]
 
@@ -57,12 +55,13 @@ class ArrayEngine(BatchEngine):
     # The beginning of episodes.
 
     def _begun(
-        self, seen: Arrays, drawn: FloatArray, mask: MaskArray, troubled: int
+        self, observations: Any, infos: dict[str, Any], troubled: int
     ) -> tuple[Any, dict[str, Any]]:
         """See ``BatchEngine._begun``."""
         self.has_moved = True
-        observations, infos = self._seen_at_start(seen[0] if seen else None, mask)
-        return observations, infos | drawn_info(self.env.inside.draws, drawn, mask)
+        made = observations if self.env.inside.pool_observes else None
+        observations, more = self._seen_at_start(made, infos["_drawn"])
+        return observations, more | infos
 
     def _seen_at_start(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
         """See ``BatchEngine._seen_at_start``."""
@@ -72,16 +71,18 @@ class ArrayEngine(BatchEngine):
             self._blame_arrays(error)
             raise
 
+    def roll_out(self, actions: npt.NDArray[Any]) -> None:
+        """See ``Engine.roll_out``: hooks take one step at a time."""
+
     # A step.
 
-    def _play_step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+    def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
         """See ``BatchEngine._play_step``."""
-        taken = self._take_actions(actions, resetting)
-        if self._play.step is None:
+        taken, step = self._take_actions(actions, resetting), self._play.step
+        if step is None:
             return self._step_pool(taken, resetting)
         self.has_moved = True
-        arrays, starts = self._new_arrays(), self._starts(resetting)
-        return self._completed(arrays, self._play.step(taken, *arrays, starts), starts)
+        return step(taken, False)
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
         """See ``BatchEngine._take_actions``; the hook makes the inputs.
@@ -103,21 +104,12 @@ class ArrayEngine(BatchEngine):
         finally:
             read.action, read.previous_action, read.previous_state = before
 
-    def _completed(
-        self,
-        arrays: tuple[FloatArray, MaskArray, MaskArray, Arrays],
-        played: Played,
-        starts: Arrays | None,
-        resting: MaskArray | None = None,
-    ) -> StepResult:
-        """See ``BatchEngine._completed``; the hooks make the result."""
-        (rewards, terminated, truncated, seen), (troubled, *_) = arrays, played
-        observed, fresh, infos = seen[0] if seen else None, resting, {}
-        if starts is not None:
-            fresh, infos = starts[0], self._infos_of_starts(starts)
-        result = StepResult(observed, rewards, terminated, truncated, infos)
-        result = self._concluded(result, troubled, fresh)
-        self._settle(result, troubled, fresh)
+    def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
+        """See ``BatchEngine._completed``."""
+        result, troubled, _, started = played
+        started = idle if started is None else started
+        result = self._concluded(result, troubled, started)
+        self._settle(result, troubled, started)
         return result
 
     def _concluded(
@@ -129,7 +121,7 @@ class ArrayEngine(BatchEngine):
         if started is not None:
             idle = started if idle is None else idle | started
         self._idle, self._busy = idle, None if idle is None else ~idle
-        observed = result.observations
+        observed = result.observations if inside.pool_observes else None
         try:
             stopped = result.terminated if troubled else False
             seen, rewards, terminated, truncated = conclude(

@@ -37,23 +37,16 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import array_of, checked_actions
-from fmugym.vector.arguments import only_mask_of
 from fmugym.vector.attributes import require_settable
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult, attribute, failed_in
-from fmugym.vector.engines.layout import Arrays, Layout
+from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import (
-    copy_rows,
-    drawn_info,
-    final_infos,
-    last_observations,
-    not_finite,
-    observation_of,
-)
+from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
+from fmugym.vector.rollouts import costs_in
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
     columns_of,
@@ -136,9 +129,8 @@ class BatchEngine(Engine):
             self._start_values,
             (no_draws() if native is None else native, drawn, self._streams.states),
             self._limit,
-            layout.observes,
+            (StepResult, *layout.form, layout.shapes, late_info(draws)),
         )
-        self._last, self._number_of_draws = layout.new(), len(drawn)
         starts, rows = env.config.episode_variables, memory.variables
         fit = all(np.shape(start) == rows[n].shape[:-1] for n, start in starts.items())
         has_all_starts = native is not None and fit
@@ -288,42 +280,32 @@ class BatchEngine(Engine):
             observations, infos = self._seen_at_start(None, mask)
         finally:
             self.note_starts(mask)
-        return observations, infos | drawn_info(draws, self._spread(drawn, mask), mask.copy())
-
-    def _spread(self, drawn: FloatArray, mask: MaskArray) -> FloatArray:
-        """Drawn values in the columns of the environments in a mask."""
-        values = np.zeros((len(drawn), self._n))
-        values[:, mask] = drawn
-        return values
+        return observations, infos | drawn_info(draws, drawn, mask.copy())
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
         """See ``Engine.reset_by``."""
-        start, mask = self._play.start, only_mask_of(options, self._n)
-        if not self._pool_starts or start is None or mask is None:
+        if not self._pool_starts or self._play.reset is None:
             return None
-        seen, drawn = self._layout.new(), self._memory_of_draws()
         try:
-            troubled, self.any_ended = start(mask, drawn, seen)
+            done = self._play.reset(options)
         except BaseException:
             self.has_moved = True
             raise
+        if done is None:
+            return None
+        (observations, infos), troubled, self.any_ended = done
         if troubled:
             self.has_moved = True
-            require_started(self._pool, np.flatnonzero(mask))
-        return self._begun(seen, drawn, mask, troubled)
-
-    def _memory_of_draws(self) -> FloatArray:
-        return np.empty((self._number_of_draws, self._n))
+            require_started(self._pool, np.flatnonzero(infos["_drawn"]))
+        return self._begun(observations, infos, troubled)
 
     def _begun(
-        self, seen: Arrays, drawn: FloatArray, mask: MaskArray, troubled: int
+        self, observations: Any, infos: dict[str, Any], troubled: int
     ) -> tuple[Any, dict[str, Any]]:
         """The result of a reset by the pool; impossible first observations are refused."""
-        observations = self._layout.observations(seen)
         if troubled:
-            self._require_finite_start(observations, mask)
-        infos = self._layout.infos(seen, mask)
-        return observations, infos | drawn_info(self.env.inside.draws, drawn, mask)
+            self._require_finite_start(observations, infos["_drawn"])
+        return observations, infos
 
     def _seen_at_start(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
         """The observations and infos where episodes have started; refuse impossible starts.
@@ -484,33 +466,21 @@ class BatchEngine(Engine):
         if resting is not None:
             return self._step_around(actions, resting)
         if self.offsets is not None or (resetting is not None and not self._pool_starts):
-            return self._step_pool(self._take_actions(actions, resetting), resetting)
-        return self._play_step(actions, resetting)
+            taken = self._take_actions(actions, resetting)
+            return self._completed(self._step_pool(taken, resetting), resetting)
+        return self._completed(self._play_step(actions, resetting), resetting)
 
-    def _play_step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+    def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
         """Let the pool do the whole step, if it can."""
-        if self._play.step is None:
+        at_ends = self.starts_at_ends and self._starts_at_ends
+        step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
+        if step is None:
             return self._step_pool(self._take_actions(actions, resetting), resetting)
-        arrays, starts = self._new_arrays(), self._starts(resetting)
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            played = self._play.step(actions, *arrays, starts)
+            return step(actions, at_ends)
         except _REFUSALS as error:
             return self._play_step(self._converted(actions, error), resetting)
-        return self._completed(arrays, played, starts)
-
-    def _new_arrays(self) -> tuple[FloatArray, MaskArray, MaskArray, Arrays]:
-        """New arrays of rewards, terminated and truncated, and those of observations and infos."""
-        count = self._n
-        return np.empty(count), np.empty(count, _BOOL), np.empty(count, _BOOL), self._layout.new()
-
-    def _starts(self, resetting: MaskArray | None) -> Arrays | None:
-        """Where episodes start in the step of the pool, see ``Play.step``."""
-        if resetting is not None:
-            return resetting, self._memory_of_draws()
-        if self.starts_at_ends and self._starts_at_ends:
-            return np.empty(self._n, _BOOL), self._memory_of_draws(), self._last
-        return None
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
         """The actions as the pool takes them, before anything is drawn or stepped.
@@ -537,30 +507,30 @@ class BatchEngine(Engine):
         self._pool.step(None, resting)
         self._pool.statuses[resting] = 0  # a fault was told when it came
         self.add_offsets(self._pool, resting)
-        arrays = self._new_arrays()
-        result = self._completed(arrays, play.after(taken, *arrays), None, resting)
+        result = self._completed(play.after(taken), resting)
         self.ended |= resting
         self.any_ended = True
         return result
 
     @passes_refusals
-    def _step_pool(self, actions: Any, starting: MaskArray | None) -> StepResult:
+    def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
         """Start the episodes in the mask, and let the FMUs of the other environments step."""
-        play, draws, arrays = self._play, self.env.inside.draws, self._new_arrays()
+        play, draws = self._play, self.env.inside.draws
         self.has_moved = True
         if starting is None:
             play.before(actions)
             self._pool.step()
             self.add_offsets(self._pool)
-            return self._completed(arrays, play.after(actions, *arrays), None)
+            return play.after(actions)
         indices = starting.nonzero()[0]
         drawn = self._streams.draw(draws, indices)
         play.before(actions)
         self._begin(indices, draws, drawn)
         self._pool.step(None, starting)
         self.add_offsets(self._pool, starting)
-        starts = starting, self._spread(drawn, starting)
-        return self._completed(arrays, play.after(actions, *arrays), starts)
+        result, troubled, any_ended, _ = play.after(actions)
+        result.infos.update(drawn_info(draws, drawn, starting))
+        return result, troubled, any_ended, starting
 
     def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
         """The actions in the form that the pool takes, if it has refused another one."""
@@ -571,41 +541,13 @@ class BatchEngine(Engine):
             raise error
         return converted
 
-    def _completed(
-        self,
-        arrays: tuple[FloatArray, MaskArray, MaskArray, Arrays],
-        played: Played,
-        starts: Arrays | None,
-        resting: MaskArray | None = None,
-    ) -> StepResult:
-        """The result of a step of the pool, in which faults are settled.
-
-        Args:
-            arrays: Those that the pool has filled.
-            played: What the pool tells.
-            starts: Where episodes have started, see ``Play.step``.
-            resting: Which environments stay as they are.
-        """
-        (rewards, terminated, truncated, seen), layout = arrays, self._layout
-        troubled, self.any_ended, started = played
-        infos = layout.infos_of_step(seen)
-        if starts is not None and (started or len(starts) == 2):
-            infos |= self._infos_of_starts(starts)
-        result = StepResult(layout.observations(seen), rewards, terminated, truncated, infos)
+    def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
+        """The result of a step of the pool, in which faults are settled."""
+        result: StepResult
+        result, troubled, self.any_ended, started = played
         if troubled:
-            self._settle(result, troubled, _fresh(starts, started) if resting is None else resting)
+            self._settle(result, troubled, idle if started is None else started)
         return result
-
-    def _infos_of_starts(self, starts: Arrays) -> dict[str, Any]:
-        """What infos tell of episodes that have started, and of those that they follow."""
-        mask, drawn, *more = starts
-        infos = drawn_info(self.env.inside.draws, drawn, mask)
-        for last in more:
-            observations, space = self._layout.observations(last), self.env.observation_space
-            infos |= final_infos(
-                last_observations(space, observations, mask), self._layout.infos(last, mask), mask
-            )
-        return infos
 
     def _settle(self, result: StepResult, troubled: int, started: MaskArray | None) -> None:
         """Find numbers that are not finite, and handle them and failures."""
@@ -627,6 +569,19 @@ class BatchEngine(Engine):
             with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
                 array = array.astype(space.dtype)
         return np.ascontiguousarray(array)
+
+    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
+        """See ``Engine.roll_out``."""
+        if not self._pool.rolls_out:
+            return None
+        shape = len(actions), self._n
+        judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
+        arrays, observations, infos = self._layout.of_steps(len(actions))
+        self.has_moved = True
+        offsets = np.empty(0) if self.offsets is None else self.offsets
+        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
+            return None
+        return observations, *judged, costs_in(infos, shape)
 
     def _write_inputs(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
         hook_results.write_inputs(self.env._get_inputs(), inputs)
@@ -806,14 +761,6 @@ class _Beginning(Beginning):
     def place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
         """See ``Beginning.place``."""
         self._engine._place(values, indices)
-
-
-def _fresh(starts: Arrays | None, started: int) -> MaskArray | None:
-    """Where episodes have started in a step; None if nowhere."""
-    if starts is None or (len(starts) == 3 and not started):
-        return None
-    mask: MaskArray = starts[0]
-    return mask
 
 
 def _called(

@@ -1,25 +1,22 @@
-"""The arrays of observations and infos that a step or the start of episodes fills."""
+"""The arrays that a compiled step fills, and the observations and infos in them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import MaskArray
-from fmugym.vector.codec import coded, with_masks
+from fmugym.vector.codec import mapped
 from fmugym.vector.hooks.task_programs import TaskPrograms
 
-__all__ = ["Arrays", "Layout"]
-
-Arrays = tuple[Any, ...]
-"""Those of observations and infos, environments first."""
+__all__ = ["Layout"]
 
 
 class Layout:
-    """The arrays that the pool or a program fills, and the observations and infos in them.
+    """The arrays that a program or the pool fills, and the observations and infos in them.
 
     Args:
         task: The programs.
@@ -28,43 +25,64 @@ class Layout:
 
     Attributes:
         shapes: The shape and type of each array.
-        observes: Whether the pool fills the observations, and no program does.
-        is_plain: Whether there is one array, that of the observations.
+        form: That of the observations and that of the infos, as the pool takes them: the number of
+            an array, or a tuple of names and forms.
     """
 
     def __init__(self, task: TaskPrograms, env: FMUEnv, count: int) -> None:
         self._paths = [array.path for array in task.seen]
-        self.shapes = [((count, *array.shape), array.dtype) for array in task.seen]
-        self.observes = not task.seen and env.inside.pool_observes
-        if self.observes:
+        self.shapes = tuple(((count, *array.shape), array.dtype) for array in task.seen)
+        if not task.seen and env.inside.pool_observes:
             self._paths = [("observation",)]
-            self.shapes = [((count, env.inside.output_count), np.dtype(np.float32))]
-        self.is_plain = self._paths == [("observation",)]
-        self._all = np.ones(count, np.bool_)
+            self.shapes = (((count, env.inside.output_count), np.dtype(np.float32)),)
+        observations, infos = self._nested(range(len(self._paths)))
+        self.form = _pairs(observations), _pairs(infos)
 
-    def new(self) -> Arrays:
-        """New arrays to be filled."""
-        return tuple([np.empty(shape, dtype) for shape, dtype in self.shapes])
+    def of_steps(self, steps: int) -> tuple[Any, Any, dict[str, Any]]:
+        """Make the arrays of many steps, which are the first axis.
 
-    def observations(self, arrays: Arrays) -> Any:
-        """The observations: an array, or a dict of arrays."""
-        return arrays[0] if self.is_plain else self.nested(arrays)["observation"]
+        Returns:
+            The arrays, or the only one; and the observations and infos that they hold.
+        """
+        arrays = tuple(np.empty((steps, *shape), dtype) for shape, dtype in self.shapes)
+        return arrays[0] if len(arrays) == 1 else arrays, *self._nested(arrays)
 
-    def infos_of_step(self, arrays: Arrays) -> dict[str, Any]:
-        """The infos of all environments."""
-        return {} if self.is_plain else with_masks(self.nested(arrays)["info"], self._all)
+    def of_one(self) -> tuple[tuple[Any, ...], Any, Callable[[Any], tuple[Any, Any]] | None]:
+        """The arrays of a single environment.
 
-    def infos(self, arrays: Arrays, mask: MaskArray) -> dict[str, Any]:
-        """The infos of some environments."""
-        return {} if self.is_plain else coded(self.nested(arrays)["info"], mask)
+        Returns:
+            The shape and type of each; the form of what they are in; and what takes the observation
+            and the info from there, or None if it is the observation.
+        """
+        if self.form == (0, ()) and len(self.shapes[0][0]) > 1:
+            ((_, *shape), dtype) = self.shapes[0]
+            return ((tuple(shape), dtype),), 0, None
+        return self.shapes, tuple(enumerate(self.form)), _of_one
 
-    def nested(self, arrays: Iterable[Any]) -> dict[str, Any]:
-        """The arrays in the places of observations and infos."""
+    def _nested(self, leaves: Iterable[Any]) -> tuple[Any, dict[str, Any]]:
+        """Something for each array, in the places of observations and infos."""
         tree: dict[str, Any] = {"observation": {}, "info": {}}
-        for path, array in zip(self._paths, arrays, strict=True):
+        for path, leaf in zip(self._paths, leaves, strict=True):
             *parents, name = path
             place = tree
             for parent in parents:
                 place = place.setdefault(parent, {})
-            place[name] = array
+            place[name] = leaf
+        return tree["observation"], tree["info"]
+
+
+def _of_one(tree: dict[int, Any]) -> tuple[Any, Any]:
+    """The observation and the info of a single environment."""
+    return mapped(_first, tree[0]), mapped(_first, tree[1])
+
+
+def _first(array: npt.NDArray[Any]) -> Any:
+    """An array without its first axis of one; if it has no other, a number."""
+    return array[0].copy() if array.ndim > 1 else array.item()
+
+
+def _pairs(tree: Any) -> Any:
+    """Make tuples of dicts."""
+    if not isinstance(tree, dict):
         return tree
+    return tuple((name, _pairs(value)) for name, value in tree.items())

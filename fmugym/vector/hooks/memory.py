@@ -86,7 +86,7 @@ class Memory:
         starts: FloatArray,
         draws: tuple[Any, Sequence[Draw], npt.NDArray[np.uint64]],
         limit: int,
-        observes: bool,
+        form: tuple[Any, ...],
     ) -> Play:
         """Give a pool everything it needs for steps.
 
@@ -96,9 +96,13 @@ class Memory:
             starts: The values of each parameter, a row each.
             draws: What draws values natively, what it draws, and the streams.
             limit: The number of steps after which episodes are truncated.
-            observes: Whether the pool fills the observations, and no program does.
+            form: How the pool makes results: their type, the forms of observations and infos, the
+                shapes and types of their arrays, and what makes the info of a reset.
         """
         native, drawn, streams = draws
+        *kinds, shapes, late = form
+        flags, real = ((self._n,), self._done.dtype), np.dtype(np.float64)
+        judged = ((self._n,), real), flags, flags, flags
         return pool.prepare_play(
             self._env.inside.draws.model_variables,
             (task.inputs.with_rows(self.find), task.judgement.with_rows(self.find)),
@@ -106,7 +110,9 @@ class Memory:
             starts,
             (native, streams),
             (self._readings.step_count, self.ended, limit),
-            self._surroundings(task, drawn, observes),
+            self._surroundings(
+                task, drawn, (*kinds, (*shapes, *judged, ((len(drawn), self._n), real)), late)
+            ),
         )
 
     def find(self, row: Row) -> Any:
@@ -153,14 +159,14 @@ class Memory:
         }
 
     def _surroundings(
-        self, task: TaskPrograms, drawn: Sequence[Draw], observes: bool
+        self, task: TaskPrograms, drawn: Sequence[Draw], results: tuple[Any, ...]
     ) -> dict[str, Any]:
         """What the pool keeps beside the programs; see ``NativePool.prepare_play``.
 
         Args:
             task: The programs.
             drawn: What the pool draws.
-            observes: Whether it fills the observations.
+            results: How it makes results.
         """
         env, draws = self._env, self._env.inside.draws
         names = draws.parameter_names
@@ -189,7 +195,7 @@ class Memory:
                 if name in flat
                 for row, value in zip(flat[name], self._elements(name, start), strict=True)
             ),
-            "observes": observes,
+            "results": results,
         }
 
 

@@ -1,0 +1,226 @@
+#include "arrays.h"
+
+#include <math.h>
+#include <string.h>
+
+/* What is built with the headers of numpy 2 also runs with numpy 1.26. */
+#define NPY_TARGET_VERSION NPY_1_25_API_VERSION
+#define NPY_NO_DEPRECATED_API NPY_1_25_API_VERSION
+#include <numpy/arrayobject.h>
+
+#if NPY_ABI_VERSION < 0x02000000
+#error "the extension must be built with numpy 2 or newer"
+#endif
+
+/* Where objects of numpy.ndarray have the list of their weak references. */
+static Py_ssize_t weak_references;
+
+bool numpy_import(void) {
+    if (PyArray_ImportNumPyAPI() < 0) {
+        return false;
+    }
+    PyObject *place = PyObject_GetAttrString((PyObject *)&PyArray_Type, "__weakrefoffset__");
+    weak_references = place == NULL ? -1 : PyLong_AsSsize_t(place);
+    Py_XDECREF(place);
+    return weak_references >= 0;
+}
+
+/* Taking over */
+
+static PyArrayObject *new_array(const Maker *maker) {
+    Py_INCREF(maker->type); /* which the function takes */
+    return (PyArrayObject *)PyArray_Empty(maker->dimensions, maker->shape,
+                                          (PyArray_Descr *)maker->type, 0);
+}
+
+static bool take(Maker *maker, PyObject *type, int dimensions, const Py_ssize_t *shape) {
+    maker->type = Py_NewRef(type);
+    maker->dimensions = dimensions;
+    memcpy(maker->shape, shape, (size_t)dimensions * sizeof *shape);
+    PyArrayObject *array = new_array(maker);
+    if (array == NULL) {
+        return false;
+    }
+    maker->size = (size_t)PyArray_NBYTES(array);
+    maker->flags = PyArray_FLAGS(array);
+    memcpy(maker->strides, PyArray_STRIDES(array), (size_t)dimensions * sizeof *shape);
+    Py_DECREF((PyObject *)array);
+    return true;
+}
+
+bool maker_take(Maker *maker, PyObject *arguments) {
+    Py_ssize_t shape[MOST_ARRAY_DIMENSIONS];
+    PyArray_Descr *type;
+
+    if (!PyTuple_Check(arguments) || PyTuple_Size(arguments) != 2) {
+        PyErr_SetString(PyExc_TypeError, "expected a tuple of shape and type");
+        return false;
+    }
+    const int dimensions =
+        PyArray_IntpFromSequence(PyTuple_GetItem(arguments, 0), shape, MOST_ARRAY_DIMENSIONS);
+    if (dimensions < 0 || !PyArray_DescrConverter(PyTuple_GetItem(arguments, 1), &type)) {
+        return false;
+    }
+    const bool taken = take(maker, (PyObject *)type, dimensions, shape);
+    Py_DECREF((PyObject *)type);
+    return taken;
+}
+
+void maker_drop(Maker *maker) {
+    for (size_t k = 0; k < ROUNDS; k++) {
+        Py_CLEAR(maker->made[k].array);
+    }
+    Py_CLEAR(maker->type);
+}
+
+/* Knowing arrays */
+
+static bool has_form(const Maker *maker, const PyArrayObject *array) {
+    const size_t lengths = (size_t)maker->dimensions * sizeof *maker->shape;
+
+    return PyArray_NDIM(array) == maker->dimensions &&
+           (PyObject *)PyArray_DESCR(array) == maker->type &&
+           memcmp(PyArray_DIMS(array), maker->shape, lengths) == 0 &&
+           memcmp(PyArray_STRIDES(array), maker->strides, lengths) == 0;
+}
+
+static bool has_weak_references(PyObject *array) {
+    return *(PyObject **)((char *)array + weak_references) != NULL;
+}
+
+bool maker_knows(const Maker *maker, PyObject *object, char **memory) {
+    if (!PyArray_CheckExact(object)) {
+        return false;
+    }
+    PyArrayObject *array = (PyArrayObject *)object;
+    *memory = PyArray_BYTES(array);
+    return PyArray_BASE(array) == NULL && PyArray_FLAGS(array) == maker->flags &&
+           !has_weak_references(object) && has_form(maker, array);
+}
+
+const char *maker_memory_of(const Maker *maker, PyObject *object) {
+    PyArrayObject *array = (PyArrayObject *)object;
+
+    return PyArray_CheckExact(object) && has_form(maker, array) ? PyArray_BYTES(array) : NULL;
+}
+
+/* Whether an array is what it was when it was made, and nobody else holds it. */
+static bool is_free(const Maker *maker, const Made *made) {
+    char *memory;
+
+    return made->array != NULL && Py_REFCNT(made->array) == 1 &&
+           maker_knows(maker, made->array, &memory) && memory == made->memory;
+}
+
+/* Providing */
+
+PyObject *maker_make(const Maker *maker, char **memory) {
+    PyArrayObject *array = new_array(maker);
+
+    if (array != NULL) {
+        *memory = PyArray_BYTES(array);
+    }
+    return (PyObject *)array;
+}
+
+PyObject *maker_make_blank(const Maker *maker, char **memory) {
+    PyObject *array = maker_make(maker, memory);
+    const int type = array == NULL ? NPY_BOOL : PyArray_TYPE((PyArrayObject *)array);
+
+    if (array == NULL) {
+        return NULL;
+    }
+    if (type == NPY_DOUBLE) {
+        for (size_t i = 0; i < maker->size / sizeof(double); i++) {
+            ((double *)(void *)*memory)[i] = NAN;
+        }
+    } else if (type == NPY_FLOAT) {
+        for (size_t i = 0; i < maker->size / sizeof(float); i++) {
+            ((float *)(void *)*memory)[i] = NAN;
+        }
+    } else {
+        memset(*memory, 0, maker->size);
+    }
+    return array;
+}
+
+PyObject *maker_provide(Maker *maker, char **memory) {
+    for (size_t k = 0; k < ROUNDS; k++) {
+        if (is_free(maker, &maker->made[k])) {
+            *memory = maker->made[k].memory;
+            return Py_NewRef(maker->made[k].array);
+        }
+    }
+    PyObject *array = maker_make(maker, memory);
+    if (array == NULL) {
+        return NULL;
+    }
+    Made *place = &maker->made[maker->oldest];
+    PyObject *before = place->array;
+    maker->oldest = (maker->oldest + 1) % ROUNDS;
+    *place = (Made){.array = Py_NewRef(array), .memory = *memory};
+    Py_XDECREF(before); /* may call back, and another step then replaces the new array */
+    return array;
+}
+
+/* Copying */
+
+typedef struct {
+    char *place;
+    Py_ssize_t rows, stride; /* bytes from row to row */
+    size_t size;             /* of a row, in bytes */
+} Rows;
+
+static bool take_rows_of(PyObject *object, Rows *rows) {
+    PyArrayObject *array = (PyArrayObject *)object;
+    const int last = PyArray_Check(object) ? PyArray_NDIM(array) - 1 : -1;
+
+    if (last < 0 || last > 1 || (PyArray_DIM(array, last) > 1 &&
+                                 PyArray_STRIDE(array, last) != PyArray_ITEMSIZE(array))) {
+        PyErr_SetString(PyExc_TypeError, "expected arrays whose rows have no gaps");
+        return false;
+    }
+    *rows = (Rows){.place = PyArray_BYTES(array),
+                   .rows = last == 0 ? 1 : PyArray_DIM(array, 0),
+                   .stride = last == 0 ? 0 : PyArray_STRIDE(array, 0),
+                   .size = (size_t)PyArray_DIM(array, last) * (size_t)PyArray_ITEMSIZE(array)};
+    return true;
+}
+
+static bool copy_array(PyObject *target, PyObject *source) {
+    Rows to, from;
+
+    if (!take_rows_of(target, &to) || !take_rows_of(source, &from)) {
+        return false;
+    }
+    if (to.rows != from.rows || to.size != from.size ||
+        PyArray_FailUnlessWriteable((PyArrayObject *)target, "an array to copy into") < 0) {
+        PyErr_SetString(PyExc_ValueError, "arrays differ in size, or cannot be written");
+        return false;
+    }
+    for (Py_ssize_t i = 0; i < to.rows; i++) {
+        memcpy(to.place + i * to.stride, from.place + i * from.stride, to.size);
+    }
+    return true;
+}
+
+PyObject *py_copy_arrays(PyObject *module, PyObject *args) {
+    PyObject *targets, *sources;
+
+    (void)module;
+    if (PyArray_ImportNumPyAPI() < 0 ||
+        !PyArg_ParseTuple(args, "O!O!:copy_arrays", &PyTuple_Type, &targets, &PyTuple_Type,
+                          &sources)) {
+        return NULL;
+    }
+    if (PyTuple_Size(targets) != PyTuple_Size(sources)) {
+        PyErr_SetString(PyExc_ValueError, "arrays differ in number");
+        return NULL;
+    }
+    for (Py_ssize_t i = 0; i < PyTuple_Size(targets); i++) {
+        if (!copy_array(PyTuple_GetItem(targets, i), PyTuple_GetItem(sources, i))) {
+            return NULL;
+        }
+    }
+    Py_RETURN_NONE;
+}
