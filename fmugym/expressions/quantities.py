@@ -1,4 +1,9 @@
-"""The quantities of an episode: what formulas read, and where it is found."""
+"""The quantities of an episode: what hooks, formulas and snapshots read, and where it is found.
+
+From this table come the arrays of N episodes, the numbers of one, the attributes of environments
+that hooks read, the columns of snapshots, and the names that formulas use. A new quantity is a line
+here, the line that writes it, and a sentence in ``docs/class.md``.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +12,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-__all__ = ["QUANTITIES", "EpisodeQuantity"]
+__all__ = ["KEPT", "QUANTITIES", "EpisodeQuantity"]
 
 _FLOAT: Final = np.dtype(np.float64)
+_COUNT: Final = np.dtype(np.int64)
+_FLAG: Final = np.dtype(np.bool_)
 
 
 class EpisodeQuantity(NamedTuple):
@@ -17,36 +24,49 @@ class EpisodeQuantity(NamedTuple):
 
     Attributes:
         name: Its name in graphs; keys may follow, such as the place of an output.
-        in_hooks: The attribute of an environment that has it.
+        attribute: The attribute of an environment and of ``Readings`` that has it.
+        shape: One value for each of the ``"outputs"`` and monitored variables, of the ``"states"``
+            (the outputs only) or of the ``"inputs"``; the shape of an ``"action"``; a
+            ``"number"``; values that are ``"named"``; None if it follows from others.
+        dtype: Its type; that of an action depends on the action space.
         before: The kind of the rows that a program loads before the FMU's step; None if there are
             none.
         after: The same after the FMU's step.
-        dtype: Its type; that of an action depends on the action space.
     """
 
     name: str
-    in_hooks: str
+    attribute: str
+    shape: str | None
+    dtype: np.dtype[Any] = _FLOAT
     before: str | None = None
     after: str | None = None
-    dtype: np.dtype[Any] = _FLOAT
+
+    @property
+    def in_hooks(self) -> str:
+        """Where functions of an environment find it."""
+        return "inside.readings.outputs" if self.name == "outputs" else self.attribute
 
 
 QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
     one.name: one
     for one in (
-        EpisodeQuantity("outputs", "inside.readings.values", "output", "output"),
-        EpisodeQuantity("previous_outputs", "previous_state", "output", "kept"),
-        EpisodeQuantity("inputs", "inputs", "input", "input"),
-        EpisodeQuantity("action", "action"),
-        EpisodeQuantity("previous_action", "previous_action"),
-        EpisodeQuantity("parameters", "parameters", "parameter", "parameter"),
-        EpisodeQuantity("variables", "variables", "variable", "before"),
-        EpisodeQuantity("step_count", "step_count", "step_count", "step_count", np.dtype(np.int64)),
-        EpisodeQuantity("time", "time"),
-        EpisodeQuantity("done", "done", dtype=np.dtype(np.bool_)),
-        EpisodeQuantity("after_end", "after_end", dtype=np.dtype(np.bool_)),
+        EpisodeQuantity("outputs", "outputs", "outputs", _FLOAT, "output", "output"),
+        EpisodeQuantity("previous_outputs", "previous_state", "states", _FLOAT, "output", "kept"),
+        EpisodeQuantity("inputs", "inputs", "inputs", _FLOAT, "input", "input"),
+        EpisodeQuantity("action", "action", "action"),
+        EpisodeQuantity("previous_action", "previous_action", "action"),
+        EpisodeQuantity("step_count", "step_count", "number", _COUNT, "step_count", "step_count"),
+        EpisodeQuantity("time", "time", None),
+        EpisodeQuantity("done", "done", "number", _FLAG),
+        EpisodeQuantity("after_end", "after_end", "number", _FLAG),
+        EpisodeQuantity("parameters", "parameters", "named", _FLOAT, "parameter", "parameter"),
+        EpisodeQuantity("variables", "variables", "named", _FLOAT, "variable", "before"),
     )
 }
-"""By name. ``outputs`` are those of the config and the monitored variables. Programs take the
-action from the pool, compute the time from the steps, know ``done`` once they have found it, and
-run no step after the end of an episode."""
+"""By name. Programs take the action from the pool, compute the time from the steps, know ``done``
+once they have found it, and run no step after the end of an episode."""
+
+KEPT: Final = tuple(
+    one for one in QUANTITIES.values() if one.shape is not None and one.shape != "named"
+)
+"""The quantities that are kept as numbers or arrays, in the order of columns of snapshots."""

@@ -229,7 +229,7 @@ class _Perturbation:
             self._start_at(trials)
             self._require_fine("a start", starting)
             for index in starting.tolist():
-                columns["values"][index] = self._pool.outputs[:, index].copy()
+                columns["outputs"][index] = self._pool.outputs[:, index].copy()
         before = self._pool.read(self._x).T
         self._require_states(before[starting], trials.states[starting])
         self._engine.place(columns, self._everywhere, self._everywhere)

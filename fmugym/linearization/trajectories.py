@@ -335,13 +335,13 @@ def _require_no_feedback(env: FMUEnv, action: npt.NDArray[Any]) -> None:
     Raises:
         ConfigError: If the inputs change with the outputs.
     """
-    wanted, values, state = _inputs_of(env, action), env.inside.readings.values, env.state
-    env.inside.readings.values = tuple(value + 0.01 * (abs(value) or 1.0) for value in values)
-    env.state = env.inside.readings.values[: len(state)]
+    wanted, values, state = _inputs_of(env, action), env.inside.readings.outputs, env.state
+    env.inside.readings.outputs = tuple(value + 0.01 * (abs(value) or 1.0) for value in values)
+    env.state = env.inside.readings.outputs[: len(state)]
     try:
         found = _inputs_of(env, action)
     finally:
-        env.inside.readings.values, env.state = values, state
+        env.inside.readings.outputs, env.state = values, state
     if found != wanted:
         raise ConfigError(
             "_get_inputs depends on the outputs, which directional derivatives of the FMU do not "

@@ -185,7 +185,7 @@ def _of_config(env: FMUEnv) -> Quantities:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *env.inside.readings.values[: len(outputs)],
+            *env.inside.readings.outputs[: len(outputs)],
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )

@@ -23,6 +23,7 @@ from fmugym.distributions import as_distribution, support_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name, warn_once
 from fmugym.expressions.by_numpy import hooks_of
 from fmugym.expressions.formulas import Formulas
+from fmugym.expressions.quantities import KEPT
 from fmugym.expressions.value import Value
 from fmugym.pool import Pool, PoolSpec
 from fmugym.systems import FMUSystem
@@ -173,26 +174,20 @@ class Constructed(Pictured):
         self.inside.readings = self._first_readings(names)
 
     def _first_readings(self, names: Sequence[str]) -> Readings:
-        values = (nan,) * len(names)
-        state = values[: self.inside.output_count]
-        start = {"start_time": self.inside.spec.start_time} if self.config.draws_start_time else {}
-
-        def present() -> Any:
-            return self.inside.readings.values
-
+        inside = self.inside
+        start = {"start_time": inside.spec.start_time} if self.config.draws_start_time else {}
+        values = {
+            "outputs": (nan,) * len(names),
+            "states": (nan,) * inside.output_count,
+            "inputs": tuple(start for _, start in inside.start_inputs),
+            "action": None,
+        }
         return Readings(
-            values=values,
-            out=NamedValues("output", names, present),
-            state=state,
-            previous_state=state,
-            inputs=tuple(start for _, start in self.inside.start_inputs),
-            action=None,
-            previous_action=None,
-            step_count=0,
-            done=False,
-            after_end=False,
+            NamedValues("output", names, lambda: inside.readings.outputs),
+            inside.output_count,
             parameters=MappingProxyType(start),
             variables=EpisodeVariables(self.config.variable_starts),
+            **{one.attribute: values.get(one.shape, one.dtype.type().item()) for one in KEPT},
         )
 
     def _prepare_episodes(self) -> None:

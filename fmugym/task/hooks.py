@@ -18,7 +18,7 @@ from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.inside import Inside
-from fmugym.task.readings import environments_first, read_by
+from fmugym.task.readings import READINGS, environments_first, read_by
 from fmugym.task.values import NamedValues
 
 if TYPE_CHECKING:
@@ -86,21 +86,18 @@ class Hooks(gymnasium.Env[Any, Any]):
 
     config: EnvConfig
 
-    state: Any = read_by("state", lambda env: env.inside.readings.state)
-    previous_state: Any = read_by("previous_state", lambda env: env.inside.readings.previous_state)
-    out: NamedValues = read_by("out", lambda env: env.inside.readings.out)
-    inputs: Any = read_by("inputs", lambda env: env.inside.readings.inputs)
-    action: Any = read_by("action", lambda env: env.inside.readings.action)
-    previous_action: Any = read_by(
-        "previous_action", lambda env: env.inside.readings.previous_action
-    )
-    step_count: Any = read_by("step_count", lambda env: env.inside.readings.step_count)
-    done: Any = read_by("done", lambda env: env.inside.readings.done)
-    after_end: Any = read_by("after_end", lambda env: env.inside.readings.after_end)
-    parameters: Mapping[str, Any] = read_by(
-        "parameters", lambda env: env.inside.readings.parameters
-    )
-    variables: dict[str, Any] = read_by("variables", lambda env: env.inside.readings.variables)
+    # The readings, which are made of the table of quantities below.
+    state: Any
+    previous_state: Any
+    out: NamedValues
+    inputs: Any
+    action: Any
+    previous_action: Any
+    step_count: Any
+    done: Any
+    after_end: Any
+    parameters: Mapping[str, Any]
+    variables: dict[str, Any]
 
     inside: Inside
 
@@ -264,3 +261,7 @@ class Hooks(gymnasium.Env[Any, Any]):
     def _describe_action(self) -> str:
         """The text that shows the action in the picture."""
         return ", ".join(f"{value:+.3g}" for value in self.inputs)
+
+
+for _name in READINGS:
+    setattr(Hooks, _name, read_by(_name))

@@ -45,10 +45,10 @@ def judged(env: Constructed, status: int, values: tuple[float, ...] | None = Non
             return _fault(env, inside.pool.failure(0))
     read = inside.readings
     variables = read.variables.copy() if inside.own.update else None
-    before = read.values
+    before = read.outputs
     if values is None:
         values = tuple(inside.output_row.tolist())  # Python's floats are faster
-    read.values = values
+    read.outputs = values
     read.state = values if inside.no_monitors else values[: inside.output_count]
     observed = inside.observation_row.copy() if inside.pool_observes else None
     cut_off = read.step_count >= inside.step_limit
@@ -105,7 +105,7 @@ def _fault_of_hooks(
     """
     reason = not_finite(env, reward, observation)
     read = env.inside.readings
-    read.values, variables = before
+    read.outputs, variables = before
     read.state = read.previous_state
     read.variables.update(variables or {})
     env.inside.pool.note_fault(0)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError
+from fmugym.expressions.quantities import KEPT, QUANTITIES
 from fmugym.pool.base import FloatArray
 from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
 
@@ -25,34 +26,54 @@ __all__ = [
     "reading",
 ]
 
+KEPT_NAMES: Final = tuple(one.attribute for one in KEPT)
 
-@dataclass(slots=True)
+
 class Readings:
-    """The values that hooks read from their environment.
+    """The quantities of an episode, which hooks read from their environment; see ``QUANTITIES``.
 
     In a single environment, each value is a number or a tuple of numbers. In a batch of N
     environments it is an array with the environments on its last axis.
 
+    Args:
+        out: The outputs and monitored variables by name.
+        width: The number of outputs, which come before the monitored variables.
+        values: The quantities by their attributes.
+
     Attributes:
-        values: The outputs and the monitored variables.
-        out: The same values by name.
+        out: As given.
+        width: As given.
         state: The outputs only.
+        outputs: With the monitored variables.
         previous_state, inputs, action, previous_action, step_count, done, after_end, parameters,
             variables: See ``FMUEnv``.
     """
 
-    values: Any
-    out: NamedValues
-    state: Any
-    previous_state: Any
-    inputs: Any
-    action: Any
-    previous_action: Any
-    step_count: Any
-    done: Any
-    after_end: Any
-    parameters: Mapping[str, Any]
-    variables: EpisodeVariables
+    __slots__ = (*KEPT_NAMES, "out", "parameters", "state", "variables", "width")
+
+    if TYPE_CHECKING:
+        out: NamedValues
+        width: int
+        parameters: Mapping[str, Any]
+        variables: EpisodeVariables
+        outputs: Any
+        state: Any
+        previous_state: Any
+        inputs: Any
+        action: Any
+        previous_action: Any
+        step_count: Any
+        done: Any
+        after_end: Any
+
+        def __getattr__(self, name: str) -> Any: ...
+        def __setattr__(self, name: str, value: Any) -> None: ...
+
+    def __init__(self, out: NamedValues, width: int, **values: Any) -> None:
+        self.out, self.width = out, width
+        for name, value in values.items():
+            setattr(self, name, value)
+        self.state = self.outputs[:width]
 
     def begin(
         self,
@@ -76,27 +97,34 @@ class Readings:
 
     def look(self, outputs: FloatArray) -> None:
         """Take the outputs and monitored variables of a single environment that has not stepped."""
-        self.values = tuple(outputs.tolist())
-        self.state = self.previous_state = self.values[: len(self.state)]
+        self.outputs = tuple(outputs.tolist())
+        self.state = self.previous_state = self.outputs[: self.width]
 
     def copy(self) -> Readings:
         """The same readings in an object of their own; the values are not copied."""
-        return replace(self)
+        return self.mapped(lambda value: value)
+
+    def replaced(self, **values: Any) -> Readings:
+        """The same readings but for some."""
+        result = self.copy()
+        for name, value in values.items():
+            setattr(result, name, value)
+        result.state = result.outputs[: self.width]
+        return result
 
     def mapped(self, each: Callable[[Any], Any]) -> Readings:
         """The same readings with what a function makes of each value."""
         variables = EpisodeVariables(self.variables)
         variables.update({name: each(value) for name, value in self.variables.items()})
         parameters = ParameterValues((n, each(value)) for n, value in self.parameters.items())
-        result = replace(
-            self.copy(),
-            values=each(self.values),
+        result = Readings(
+            self.out,
+            self.width,
             parameters=MappingProxyType(parameters),
             variables=variables,
-            **{name: each(getattr(self, name)) for name in _ROWS},
+            **{name: each(getattr(self, name)) for name in KEPT_NAMES},
         )
-        result.state = result.values[: len(self.state)]
-        result.out = self.out.over(lambda: result.values)
+        result.out = self.out.over(lambda: result.outputs)
         return result
 
     def take_back(self, before: tuple[Any, Any, Any, Any]) -> None:
@@ -106,12 +134,6 @@ class Readings:
             before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
         """
         self.action, self.previous_action, self.previous_state, self.inputs = before
-
-
-_ROWS: Final = (
-    *("previous_state", "inputs", "action", "previous_action", "step_count", "done", "after_end"),
-)
-"""Those that are neither mappings nor outputs."""
 
 
 class NoReadings:
@@ -128,22 +150,20 @@ def _too_early(name: str) -> str:
     return f"{name!r} is what hooks read, which there is after super().__init__(...) only"
 
 
-READINGS: Final = tuple(field.name for field in fields(Readings) if field.name != "values")
+READINGS: Final = (
+    *("state", "out"),
+    *(one.attribute for one in QUANTITIES.values() if one.shape and one.name != "outputs"),
+)
 """The attributes of an environment that hooks read."""
 
 
-def read_by(name: str, get: Callable[[Any], Any]) -> Any:
-    """Make a property of environments that is one of their readings.
-
-    Args:
-        name: That of the reading.
-        get: Reads it; a function that does nothing else is the fastest way.
-    """
+def read_by(name: str) -> Any:
+    """Make a property of environments that is one of their readings."""
 
     def put(env: Any, value: Any) -> None:
         setattr(env.inside.readings, name, value)
 
-    return property(get, put)
+    return property(attrgetter(f"inside.readings.{name}"), put)
 
 
 def environments_first(values: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import ConfigError, SimulationError
+from fmugym.expressions.quantities import KEPT, EpisodeQuantity
 from fmugym.pool import Pool
 from fmugym.pool.extension import needs_engine
 from fmugym.task.construction import Constructed
@@ -28,10 +29,8 @@ __all__ = [
 ]
 
 _WORD: Final = 2**64
-_NUMBERS: Final = ("values", "previous_state", "inputs")
-
-READ: Final = (*_NUMBERS, "action", "previous_action", "step_count", "done", "after_end")
-"""What hooks read, but for mappings."""
+READ: Final = tuple(one.attribute for one in KEPT)
+"""The quantities but for mappings."""
 
 
 def require_saving(pool: Pool) -> None:
@@ -92,14 +91,9 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
     read = env.inside.readings
-    for name in _NUMBERS:
-        setattr(read, name, tuple(np.asarray(columns[name][place], np.float64).tolist()))
-    read.state = read.values[: env.inside.output_count]
-    read.action = _native_value(columns["action"], place)
-    read.previous_action = _native_value(columns["previous_action"], place)
-    read.step_count = int(columns["step_count"][place])
-    read.done = bool(columns["done"][place])
-    read.after_end = bool(columns["after_end"][place])
+    for one in KEPT:
+        setattr(read, one.attribute, _kept_value(one, columns[one.attribute], place))
+    read.state = read.outputs[: read.width]
     parameters = {name: _native_value(c, place) for name, c in columns["parameters"].items()}
     read.parameters = MappingProxyType({n: v for n, v in parameters.items() if v is not None})
     read.variables.update(
@@ -110,6 +104,14 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
     _place_stream(env, columns, place)
     env.inside.was_reset, env.inside.ended = True, bool(columns["ended"][place])
+
+
+def _kept_value(quantity: EpisodeQuantity, column: Any, place: int) -> Any:
+    """One value of the column of a quantity, as the hooks of a single environment read it."""
+    if quantity.shape == "action":
+        return _native_value(column, place)
+    numbers = np.asarray(column[place], quantity.dtype).tolist()
+    return tuple(numbers) if isinstance(numbers, list) else numbers
 
 
 def _native_value(column: Any, place: int) -> Any:

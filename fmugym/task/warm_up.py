@@ -248,7 +248,7 @@ class WarmUps:
         env.previous_state = env.state
         pool.step(None, skip)
         require_started(pool, indices, _FAILED)
-        env.inside.readings.values = outputs = pool.outputs[:, indices]
+        env.inside.readings.outputs = outputs = pool.outputs[:, indices]
         env.state = outputs[: env.inside.output_count]
 
     def _keep(self, pool: Pool, rows: Mapping[str, Any], indices: IndexArray) -> None:

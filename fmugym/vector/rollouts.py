@@ -185,7 +185,7 @@ class Candidates:
         if self.offsets is None:
             return columns
         shifted = {}
-        for name in ("values", "previous_state"):
+        for name in ("outputs", "previous_state"):
             rows = np.asarray(columns[name], np.float64)
             shifted[name] = rows + self.offsets[: rows.shape[1]]
         return {**columns, **shifted}

@@ -135,7 +135,7 @@ class ExpressionStep:
     def _judge_again(self, env: FMUEnv) -> Result:
         """Judge a step in Python, whose status or a number is not good, from before it on."""
         inside, memory, read = env.inside, self._memory, env.inside.readings
-        values, read.values = read.values, memory.kept[:, 0]
+        values, read.outputs = read.outputs, memory.kept[:, 0]
         for name in self._updated:
             memory.variables[name][...] = memory.before[name]
         read.done, memory.ended[0] = False, False

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.expressions.quantities import KEPT
 from fmugym.pool.base import FloatArray
 from fmugym.task.readings import Readings
 from fmugym.task.values import EpisodeVariables, ParameterValues
@@ -27,26 +28,33 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
         outputs: The array of outputs and monitored variables, by default a new one.
         inputs: The array of inputs, by default a new one.
     """
-    outputs = np.zeros((len(env.out), count)) if outputs is None else outputs
     space: Any = env.action_space
-    action = np.zeros((*space.shape, count), space.dtype)
+    shapes = {
+        "outputs": (len(env.out),),
+        "states": (env.inside.output_count,),
+        "inputs": (len(env.inside.start_inputs),),
+        "action": space.shape,
+        "number": (),
+    }
+    arrays = {
+        one.attribute: np.zeros(
+            (*shapes[one.shape], count), space.dtype if one.shape == "action" else one.dtype
+        )
+        for one in KEPT
+    }
+    arrays |= {} if outputs is None else {"outputs": outputs}
+    arrays |= {} if inputs is None else {"inputs": inputs}
     variables = EpisodeVariables(env.config.variable_starts)
     variables.update({n: np.zeros((*np.shape(v), count)) for n, v in variables.items()})
     starts = env.inside.draws.variable_starts
     variables.update({n: np.repeat(start, count, axis=-1) for n, start in starts.items()})
+    values = arrays["outputs"]
     return Readings(
-        values=outputs,
-        out=env.out.over(lambda: outputs),
-        state=outputs[: env.inside.output_count],
-        previous_state=np.zeros((env.inside.output_count, count)),
-        inputs=np.zeros((len(env.inside.start_inputs), count)) if inputs is None else inputs,
-        action=action,
-        previous_action=action.copy(),
-        step_count=np.zeros(count, np.int64),
-        done=np.zeros(count, np.bool_),
-        after_end=np.zeros(count, np.bool_),
+        env.out.over(lambda: values),
+        env.inside.output_count,
         parameters=MappingProxyType({}),
         variables=variables,
+        **arrays,
     )
 
 
@@ -82,6 +90,14 @@ def _numbers(part: npt.NDArray[Any]) -> tuple[float, ...]:
     return tuple(part.tolist())
 
 
+_OF_COLUMN: Final[Mapping[str | None, Callable[[npt.NDArray[Any]], Any]]] = {
+    **dict.fromkeys(("outputs", "states", "inputs"), _numbers),
+    "action": lambda part: part[()].copy(),
+    "number": lambda part: part.item(),
+}
+"""What makes a value of an environment's part of an array, by the shape of the quantity."""
+
+
 class ColumnReadings(Readings):
     """The readings of one of N environments: its column of their arrays.
 
@@ -97,19 +113,10 @@ class ColumnReadings(Readings):
 
     def __init__(self, batch: Readings, index: int) -> None:
         self.batch, self.index = batch, index
+        self.width = batch.width
         self._parameters: Mapping[str, Any] | None = None  # as they were set
-        values = batch.values
+        values = batch.outputs
         self.out = batch.out.over(lambda: _numbers(values[:, index]))
-
-    values: Any = _column_property("values", _numbers)
-    state: Any = _column_property("state", _numbers)
-    previous_state: Any = _column_property("previous_state", _numbers)
-    inputs: Any = _column_property("inputs", _numbers)
-    action: Any = _column_property("action", lambda part: part[()].copy())
-    previous_action: Any = _column_property("previous_action", lambda part: part[()].copy())
-    step_count: Any = _column_property("step_count", lambda part: part.item())
-    done: Any = _column_property("done", lambda part: part.item())
-    after_end: Any = _column_property("after_end", lambda part: part.item())
 
     @property
     def parameters(self) -> Mapping[str, Any]:
@@ -150,13 +157,11 @@ class ColumnReadings(Readings):
         """See ``Readings.look``; the arrays have the outputs already."""
         self.batch.previous_state[:, self.index] = self.batch.state[:, self.index]
 
-    def copy(self) -> Readings:
-        """See ``Readings.copy``."""
-        values = {name: getattr(self, name) for name in Readings.__slots__}
-        values["variables"] = EpisodeVariables(self.variables)
-        values["variables"].update(self.variables)
-        values["out"] = self.out.over(lambda: values["values"])
-        return Readings(**values)
+
+for _quantity in KEPT:
+    _property = _column_property(_quantity.attribute, _OF_COLUMN[_quantity.shape])
+    setattr(ColumnReadings, _quantity.attribute, _property)
+ColumnReadings.state = _column_property("state", _numbers)
 
 
 class _ColumnVariables(EpisodeVariables):

@@ -60,7 +60,7 @@ def driven(task, controller, seed):
     observation, _ = env.reset(seed=seed)
     for _ in range(STEPS):
         observation, *_ = env.step(bound.act(observation))
-    result = env.inside.readings.values, env.inputs[0], observation[2]
+    result = env.inside.readings.outputs, env.inputs[0], observation[2]
     env.close()
     return result
 
@@ -72,7 +72,7 @@ def test_it_leads_where_the_controller_leads_as_an_agent(controller, load):
     for seed in (3, 4):
         observation, _ = env.reset(seed=seed)
         expected = driven(HOUSE, controller or "schedule 00:00=0", seed)
-        assert (env.inside.readings.values, env.inputs[0], observation[2]) == expected
+        assert (env.inside.readings.outputs, env.inputs[0], observation[2]) == expected
         assert env.time == 86400.0
         assert env.step_count == 0
 
@@ -98,7 +98,7 @@ def test_a_thermostat_whose_arguments_the_task_tells(name, change, load):
     full = "hysteresis of=T setpoint=T_set band=0 below=1 above=0"
     env, same = load(house(name, **change)), load(house(full, **change))
     assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
-    assert env.inside.readings.values == same.inside.readings.values
+    assert env.inside.readings.outputs == same.inside.readings.outputs
 
 
 def test_named_controllers_and_constants():

@@ -6,7 +6,6 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from math import isfinite
 from types import MappingProxyType, MethodType
@@ -249,7 +248,7 @@ class BatchEngine(Engine):
     ) -> FloatArray:
         """See ``Engine.evaluate``."""
         env = self.env
-        latest = replace(env.inside.readings, action=np.moveaxis(np.asarray(actions), 0, -1))
+        latest = env.inside.readings.replaced(action=np.moveaxis(np.asarray(actions), 0, -1))
         with reading(env, some(latest, indices)):
             rows = function(env)
         return np.array([np.broadcast_to(row, len(indices)) for row in rows], np.float64)

@@ -53,7 +53,7 @@ _FACTORS: Final = (-0.3, 10.0, 300.0, 1e5, -1e5)
 """Of outputs, beside limits: other magnitudes than those that episodes reach."""
 
 _READ_ONLY: Final = (
-    *("values", "previous_state", "inputs", "action", "previous_action", "step_count", "done"),
+    *("outputs", "previous_state", "inputs", "action", "previous_action", "step_count", "done"),
 )
 
 _WRITING: Final = ("_get_inputs", "_update")
@@ -173,7 +173,7 @@ def _row_of(env: FMUEnv, kind: Kind, before: Mapping[str, Any]) -> _Row:
     now = env.inside.readings.copy()
     parameters = MappingProxyType(ParameterValues(now.parameters))
     variables = _variables(now.variables)
-    kept = replace(now, parameters=parameters, variables=variables)
+    kept = now.replaced(parameters=parameters, variables=variables)
     kept.action, kept.previous_action = np.array(now.action), np.array(now.previous_action)
     return _Row(kind, kept, dict(before), bool(now.done))
 
@@ -197,11 +197,10 @@ def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
     """States around zero, of episodes that nobody has played."""
     for index in range(_STEPS // 4):
         episode, now = env.inside.draws.draw(rng), env.inside.readings.copy()
-        values = tuple(rng.normal(size=len(now.values)).tolist())
+        values = tuple(rng.normal(size=len(now.outputs)).tolist())
         variables = _variables(now.variables | episode.variables)
-        kept = replace(
-            now,
-            values=values,
+        kept = now.replaced(
+            outputs=values,
             previous_state=tuple(rng.normal(size=env.inside.output_count).tolist()),
             inputs=tuple(rng.normal(size=len(now.inputs)).tolist()),
             action=np.array(_sample_of(env.action_space, rng)),
@@ -218,13 +217,13 @@ def _at_limits(env: FMUEnv, rows: Sequence[_Row], rng: np.random.Generator) -> I
     variables = env.inside.interface.outputs + env.inside.interface.monitors
     lows, highs = (np.array(one, np.float64) for one in zip(*map(_ends_of, variables), strict=True))
     for row in rows[:: 1 + len(rows) // _ROWS_AT_LIMITS]:
-        values = np.array(row.readings.values)
+        values = np.array(row.readings.outputs)
         places = [np.where(np.isfinite(ends), ends, values) for ends in (lows, highs)]
         places += [values * factor * rng.uniform(0.5, 1.5, len(values)) for factor in _FACTORS]
         for place in places:
             before = place[: env.inside.output_count] * rng.uniform(0.9, 1.0)
-            moved = replace(
-                row.readings, values=tuple(place.tolist()), previous_state=tuple(before.tolist())
+            moved = row.readings.replaced(
+                outputs=tuple(place.tolist()), previous_state=tuple(before.tolist())
             )
             yield _Row("limit", moved, row.before, bool(rng.integers(2)))
 
@@ -250,7 +249,7 @@ def _counts(env: FMUEnv) -> tuple[int, ...]:
     arrays = spaces.flatten_space(env.observation_space).shape or (1,)
     inside = env.inside
     lengths = {*arrays, *np.shape(inside.no_action), inside.output_count}
-    lengths |= {len(inside.start_inputs), len(inside.readings.values)}
+    lengths |= {len(inside.start_inputs), len(inside.readings.outputs)}
     for part in _boxes(env.observation_space):
         lengths |= set(part.shape)
     for value in env.variables.values():
@@ -287,7 +286,7 @@ def _batch_of(env: FMUEnv, rows: Sequence[_Row], name: str) -> Readings:
     batch = batched(env, len(rows))
     states = [_moment(env, row, name) for row in rows]
     for index, one in enumerate(states):
-        batch.values[:, index], batch.previous_state[:, index] = one.values, one.previous_state
+        batch.outputs[:, index], batch.previous_state[:, index] = one.outputs, one.previous_state
         batch.inputs[:, index], batch.step_count[index] = one.inputs, one.step_count
         batch.action[..., index] = one.action
         batch.previous_action[..., index] = one.previous_action
@@ -310,12 +309,12 @@ def _moment(env: FMUEnv, row: _Row, name: str) -> Readings:
     """What a hook reads in one environment: not all is known yet when the first are called."""
     now = row.readings
     if name not in _WRITING:
-        return replace(now, done=row.done and name != "_is_done")
+        return now.replaced(done=row.done and name != "_is_done")
     variables = _variables(row.before)
     if name == "_update":
-        return replace(now, variables=variables, done=False)
-    values = (*now.previous_state, *now.values[env.inside.output_count :])
-    return replace(now, variables=variables, values=values, done=False)
+        return now.replaced(variables=variables, done=False)
+    values = (*now.previous_state, *now.outputs[env.inside.output_count :])
+    return now.replaced(variables=variables, outputs=values, done=False)
 
 
 # The comparison
@@ -475,7 +474,7 @@ def _require_unchanged(before: Mapping[str, Any], after: Mapping[str, Any]) -> N
                 "changes self.variables, which only _get_inputs and _update may do"
             )
         if not _same(value, after[name]):
-            told = "state and self.out" if name == "values" else name
+            told = "state and self.out" if name == "outputs" else name
             raise _DifferenceError(f"changes the arrays in self.{told} in place")
 
 

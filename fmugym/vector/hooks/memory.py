@@ -44,7 +44,7 @@ class Memory:
         self._env, self._readings = env, readings
         self._n = len(ended)
         self.ended, self.parameters = ended, readings.parameters
-        self.kept, self._done = np.zeros_like(readings.values), np.zeros(self._n, np.bool_)
+        self.kept, self._done = np.zeros_like(readings.outputs), np.zeros(self._n, np.bool_)
         self.actions = _copied(readings.action), _copied(readings.previous_action)
         self.variables: dict[str, npt.NDArray[Any]] = {}
         self.before: dict[str, npt.NDArray[Any]] = {}
@@ -122,7 +122,7 @@ class Memory:
         name: Any = rest[0]
         match kind:
             case "output":
-                return self._readings.values[index]
+                return self._readings.outputs[index]
             case "kept":
                 return self.kept[index]
             case "input":
