@@ -27,7 +27,7 @@ class EpisodeQuantity(NamedTuple):
         attribute: The attribute of an environment and of ``Readings`` that has it.
         shape: One value for each of the ``"outputs"`` and monitored variables, of the ``"states"``
             (the outputs only) or of the ``"inputs"``; the shape of an ``"action"``; a
-            ``"number"``; values that are ``"named"``; None if it follows from others.
+            ``"number"``; values that are ``"named"``; ``"derived"`` if it follows from others.
         dtype: Its type; that of an action depends on the action space.
         before: The kind of the rows that a program loads before the FMU's step; None if there are
             none.
@@ -36,7 +36,7 @@ class EpisodeQuantity(NamedTuple):
 
     name: str
     attribute: str
-    shape: str | None
+    shape: str
     dtype: np.dtype[Any] = _FLOAT
     before: str | None = None
     after: str | None = None
@@ -56,7 +56,7 @@ QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
         EpisodeQuantity("action", "action", "action"),
         EpisodeQuantity("previous_action", "previous_action", "action"),
         EpisodeQuantity("step_count", "step_count", "number", _COUNT, "step_count", "step_count"),
-        EpisodeQuantity("time", "time", None),
+        EpisodeQuantity("time", "time", "derived"),
         EpisodeQuantity("done", "done", "number", _FLAG),
         EpisodeQuantity("after_end", "after_end", "number", _FLAG),
         EpisodeQuantity("parameters", "parameters", "named", _FLOAT, "parameter", "parameter"),
@@ -66,7 +66,5 @@ QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
 """By name. Programs take the action from the pool, compute the time from the steps, know ``done``
 once they have found it, and run no step after the end of an episode."""
 
-KEPT: Final = tuple(
-    one for one in QUANTITIES.values() if one.shape is not None and one.shape != "named"
-)
+KEPT: Final = tuple(one for one in QUANTITIES.values() if one.shape not in {"named", "derived"})
 """The quantities that are kept as numbers or arrays, in the order of columns of snapshots."""

@@ -152,7 +152,8 @@ def _too_early(name: str) -> str:
 
 READINGS: Final = (
     *("state", "out"),
-    *(one.attribute for one in QUANTITIES.values() if one.shape and one.name != "outputs"),
+    *(one.attribute for one in KEPT if one.name != "outputs"),
+    *(one.attribute for one in QUANTITIES.values() if one.shape == "named"),
 )
 """The attributes of an environment that hooks read."""
 

@@ -29,7 +29,7 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
         inputs: The array of inputs, by default a new one.
     """
     space: Any = env.action_space
-    shapes = {
+    shapes: dict[str, tuple[int, ...]] = {
         "outputs": (len(env.out),),
         "states": (env.inside.output_count,),
         "inputs": (len(env.inside.start_inputs),),
@@ -48,7 +48,7 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     variables.update({n: np.zeros((*np.shape(v), count)) for n, v in variables.items()})
     starts = env.inside.draws.variable_starts
     variables.update({n: np.repeat(start, count, axis=-1) for n, start in starts.items()})
-    values = arrays["outputs"]
+    values: Any = arrays["outputs"]
     return Readings(
         env.out.over(lambda: values),
         env.inside.output_count,
@@ -90,7 +90,7 @@ def _numbers(part: npt.NDArray[Any]) -> tuple[float, ...]:
     return tuple(part.tolist())
 
 
-_OF_COLUMN: Final[Mapping[str | None, Callable[[npt.NDArray[Any]], Any]]] = {
+_OF_COLUMN: Final[Mapping[str, Callable[[npt.NDArray[Any]], Any]]] = {
     **dict.fromkeys(("outputs", "states", "inputs"), _numbers),
     "action": lambda part: part[()].copy(),
     "number": lambda part: part.item(),

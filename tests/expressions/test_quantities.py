@@ -66,7 +66,7 @@ def test_of_many_environments(make_envs):
     for _ in range(15):
         *_, infos = envs.step(envs.action_space.sample())
         for name in TASK["reward"]:
-            attribute = QUANTITIES[name].in_hooks.removeprefix("inside.readings.")
-            rows = envs.get_attr("state" if attribute == "values" else attribute)
+            attribute = QUANTITIES[name].attribute
+            rows = envs.get_attr("state" if attribute == "outputs" else attribute)
             expected = [row[KEYS[name]] if name in KEYS else row for row in rows]
             assert infos["reward_terms"][name].tolist() == expected, name
