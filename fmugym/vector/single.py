@@ -6,7 +6,6 @@ import logging
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
@@ -28,6 +27,9 @@ logger = logging.getLogger(__name__)
 
 _REFUSALS: Final = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take an action."""
+
+_INTEGERS: Final = frozenset({int, np.int64})
+"""The types of actions that need no conversion."""
 
 
 def expression_step_of(env: FMUEnv) -> ExpressionStep | None:
@@ -98,39 +100,35 @@ class ExpressionStep:
             ConfigError: If the action does not fit, or the inputs that it makes are not finite.
             SimulationError: After a fault with ``on_fault="raise"``.
         """
-        actions, inside = self._array_of(env, action), env.inside
+        inside, given = env.inside, action
+        if self._is_discrete:
+            given = self._number
+            given[0] = action if type(action) in _INTEGERS else as_element(env, action)
+        elif type(action) is not np.ndarray:
+            given = as_element(env, action)
         inside.ended = True  # until the step is done: after an exception no episode goes on
         try:
-            played = self._play(actions, False)
+            result, troubled, ended, _ = self._play(given, False)
         except _REFUSALS as error:
             require_refusal(error)
-            played = self._play_element(env, action)
-        (seen, rewards, terminated, truncated, info), troubled, _, _ = played
+            result, troubled, ended, _ = self._play_element(env, action)
         if troubled:
             return self._judge_again(env)
-        if terminated or truncated:
+        if ended:
             self._memory.ended[0] = False  # a reset begins the next episode, not the pool
         else:
             inside.ended = False
+        seen, rewards, terminated, truncated, info = result
         if self._divided is not None:
             seen, info = self._divided(seen)
         return seen, rewards.item(), terminated.item(), truncated.item(), info
 
-    def _array_of(self, env: FMUEnv, action: Any) -> npt.NDArray[Any]:
-        """The action of the only environment in an array."""
-        if self._is_discrete and (type(action) is int or type(action) is np.int64):
-            self._number[0] = action
-            return self._number
-        if type(action) is np.ndarray and not self._is_discrete:
-            return action[np.newaxis]
-        return as_element(env, action)[np.newaxis]
-
     def _play_element(self, env: FMUEnv, action: Any) -> Any:
         """Do a step with an action that the pool has refused in its own type or shape."""
         env.inside.ended = False
-        actions = as_element(env, action)[np.newaxis]
+        element = as_element(env, action)
         env.inside.ended = True
-        return self._play(actions, False)
+        return self._play(np.array([element]), False)
 
     def _judge_again(self, env: FMUEnv) -> Result:
         """Judge a step in Python, whose status or a number is not good, from before it on."""

@@ -63,8 +63,8 @@ typedef struct {
 /* Takes memory that must have so many bytes, whatever its items are. */
 bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size);
 
-/* Takes an array of actions. Those of another type or shape come back as an exception; the caller then
- * converts them. */
+/* Takes an array of actions, or the action of the only environment. Those of another type or shape come
+ * back as an exception; the caller then converts them. */
 bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer *buffer);
 
 /* Clears what is used of the many buffers. */

@@ -32,11 +32,12 @@ bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer 
     if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
         return false;
     }
-    bool fits = b->ndim == playing->action_dimensions &&
+    const int first = b->ndim == playing->action_dimensions - 1 && playing->action_shape[0] == 1;
+    bool fits = b->ndim == playing->action_dimensions - first &&
                 has_letter(b, playing->action_letter) &&
                 b->itemsize == (Py_ssize_t)playing->form.play.actions.size;
     for (int i = 0; fits && i < b->ndim; i++) {
-        fits = b->shape[i] == playing->action_shape[i];
+        fits = b->shape[i] == playing->action_shape[first + i];
     }
     if (!fits || (uintptr_t)b->buf % (uintptr_t)b->itemsize != 0) {
         PyErr_SetString(PyExc_TypeError, "the actions have another type or shape");
