@@ -6,7 +6,6 @@ import logging
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.expressions.program import UncompilableError
@@ -27,9 +26,6 @@ logger = logging.getLogger(__name__)
 
 _REFUSALS: Final = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take an action."""
-
-_INTEGERS: Final = frozenset({int, np.int64})
-"""The types of actions that need no conversion."""
 
 
 def expression_step_of(env: FMUEnv) -> ExpressionStep | None:
@@ -80,8 +76,6 @@ class ExpressionStep:
         )
         self._play: Any = play.step
         self._updated = task.updated
-        self._is_discrete = isinstance(env.action_space, spaces.Discrete)
-        self._number = np.zeros(1, memory.actions[0].dtype)
         self._take_over(env, ColumnReadings(rows, 0))
 
     def _take_over(self, env: FMUEnv, readings: ColumnReadings) -> None:
@@ -100,15 +94,10 @@ class ExpressionStep:
             ConfigError: If the action does not fit, or the inputs that it makes are not finite.
             SimulationError: After a fault with ``on_fault="raise"``.
         """
-        inside, given = env.inside, action
-        if self._is_discrete:
-            given = self._number
-            given[0] = action if type(action) in _INTEGERS else as_element(env, action)
-        elif type(action) is not np.ndarray:
-            given = as_element(env, action)
+        inside = env.inside
         inside.ended = True  # until the step is done: after an exception no episode goes on
         try:
-            result, troubled, ended, _ = self._play(given, False)
+            result, troubled, ended, _ = self._play(action, False)
         except _REFUSALS as error:
             require_refusal(error)
             result, troubled, ended, _ = self._play_element(env, action)
@@ -118,17 +107,17 @@ class ExpressionStep:
             self._memory.ended[0] = False  # a reset begins the next episode, not the pool
         else:
             inside.ended = False
-        seen, rewards, terminated, truncated, info = result
+        seen, reward, terminated, truncated, info = result
         if self._divided is not None:
             seen, info = self._divided(seen)
-        return seen, rewards.item(), terminated.item(), truncated.item(), info
+        return seen, reward, terminated, truncated, info
 
     def _play_element(self, env: FMUEnv, action: Any) -> Any:
         """Do a step with an action that the pool has refused in its own type or shape."""
         env.inside.ended = False
         element = as_element(env, action)
         env.inside.ended = True
-        return self._play(np.array([element]), False)
+        return self._play(element if element.shape else element.item(), False)
 
     def _judge_again(self, env: FMUEnv) -> Result:
         """Judge a step in Python, whose status or a number is not good, from before it on."""

@@ -176,7 +176,8 @@ static bool results_fit(const PyPool *self, const Playing *playing) {
     const Settings *s = &self->pool.settings;
     const Results *r = playing->results;
     const size_t seen = playing->form.judgement.program.number_of_seen;
-    bool fit = results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
+    bool fit = (s->count == 1 || !results_are_of_one(r)) &&
+               results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
                results_size(r, TERMINATED_ARRAY) == s->count &&
                results_size(r, TRUNCATED_ARRAY) == s->count &&
                results_size(r, MASK_ARRAY) == s->count &&

@@ -55,6 +55,7 @@ typedef struct {
     size_t seen_sizes[MOST_SEEN];
     Turn turn;
     Call call;
+    int64_t number; /* the action of the only environment, if it is an integer */
     bool bad_action;
     size_t troubled;
     Ends ends;
@@ -63,9 +64,9 @@ typedef struct {
 /* Takes memory that must have so many bytes, whatever its items are. */
 bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size);
 
-/* Takes an array of actions, or the action of the only environment. Those of another type or shape come
- * back as an exception; the caller then converts them. */
-bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer *buffer);
+/* Takes an array of actions, or the action of the only environment: an array, or an integer. Those of
+ * another type or shape come back as an exception; the caller then converts them. */
+bool take_actions_of_turn(const Playing *playing, PyObject *actions, PyTurn *t);
 
 /* Clears what is used of the many buffers. */
 void clear_turn(const Playing *playing, PyTurn *t);

@@ -28,11 +28,15 @@ static bool has_letter(const Py_buffer *buffer, int letter) {
     return *format != '\0' && format[1] == '\0' && (*format == letter || is_long);
 }
 
-bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer *b) {
+static bool is_of_one(const Playing *playing) {
+    return playing->results != NULL && results_are_of_one(playing->results);
+}
+
+static bool take_array(const Playing *playing, PyObject *actions, Py_buffer *b) {
     if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
         return false;
     }
-    const int first = b->ndim == playing->action_dimensions - 1 && playing->action_shape[0] == 1;
+    const int first = is_of_one(playing) && b->ndim == playing->action_dimensions - 1;
     bool fits = b->ndim == playing->action_dimensions - first &&
                 has_letter(b, playing->action_letter) &&
                 b->itemsize == (Py_ssize_t)playing->form.play.actions.size;
@@ -44,6 +48,27 @@ bool take_array_of_actions(const Playing *playing, PyObject *actions, Py_buffer 
         return false;
     }
     return true;
+}
+
+static bool take_integer(PyObject *action, PyTurn *t) {
+    PyObject *integer = PyBool_Check(action) ? NULL : PyNumber_Index(action);
+
+    t->number = integer == NULL ? 0 : PyLong_AsLongLong(integer);
+    t->buffers[ACTIONS].buf = &t->number;
+    Py_XDECREF(integer);
+    if (integer == NULL || PyErr_Occurred()) {
+        PyErr_SetString(PyExc_TypeError, "the action is no integer of 64 bits");
+        return false;
+    }
+    return true;
+}
+
+bool take_actions_of_turn(const Playing *playing, PyObject *actions, PyTurn *t) {
+    const bool is_discrete = playing->form.play.actions.check == ACTIONS_IN_RANGE;
+
+    return is_discrete && is_of_one(playing) && !PySequence_Check(actions)
+               ? take_integer(actions, t)
+               : take_array(playing, actions, &t->buffers[ACTIONS]);
 }
 
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
@@ -193,7 +218,7 @@ static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *act
     bool done = false;
 
     clear_turn(playing, &t);
-    if (take_array_of_actions(playing, actions, &t.buffers[ACTIONS])) {
+    if (take_actions_of_turn(playing, actions, &t)) {
         settle_turn(self, playing, &t);
         done = play_turn(self, BEFORE, &t);
     }
@@ -232,7 +257,7 @@ static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObj
 
     clear_turn(playing, &t);
     if (provide(playing->results, starts, at_ends, &arrays) &&
-        take_array_of_actions(playing, actions, &t.buffers[ACTIONS])) {
+        take_actions_of_turn(playing, actions, &t)) {
         settle_step(self, playing, starts, at_ends, &arrays, &t);
         result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }
@@ -283,7 +308,7 @@ PyObject *py_check_actions(PyObject *object, PyObject *actions) {
     PyObject *capsule = Py_NewRef(self->playing);
     const Playing *playing = playing_of(capsule);
     clear_turn(playing, &t);
-    bool good = take_array_of_actions(playing, actions, &t.buffers[ACTIONS]);
+    bool good = take_actions_of_turn(playing, actions, &t);
     if (good) {
         settle_turn(self, playing, &t);
         good = !play_has_bad_action(&t.turn, 1);

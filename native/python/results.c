@@ -118,6 +118,10 @@ void results_free(Results *r) {
     free(r);
 }
 
+bool results_are_of_one(const Results *r) {
+    return r->late == Py_None;
+}
+
 size_t results_number_of_seen(const Results *r) {
     return r->number_of_seen;
 }
@@ -248,6 +252,16 @@ static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_start
     return infos;
 }
 
+/* The rewards, or where episodes have ended; of a single environment a number. */
+static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t array) {
+    if (!results_are_of_one(r)) {
+        return Py_NewRef(a->arrays[array]);
+    }
+    const char *memory = a->memory[array];
+    return array == REWARDS_ARRAY ? PyFloat_FromDouble(*(const double *)(const void *)memory)
+                                  : PyBool_FromLong(*memory);
+}
+
 /* Makes the tuple without the constructor of its class, which takes several times as long. */
 PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started, bool at_ends) {
     PyObject *observations = form_of(&r->observations, a->arrays);
@@ -261,7 +275,7 @@ PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started, b
     }
     PyTuple_SetItem(result, 0, observations);
     for (Py_ssize_t i = 0; i < 3; i++) {
-        PyTuple_SetItem(result, 1 + i, Py_NewRef(a->arrays[REWARDS_ARRAY + i]));
+        PyTuple_SetItem(result, 1 + i, judged_of(r, a, REWARDS_ARRAY + (size_t)i));
     }
     PyTuple_SetItem(result, 4, infos);
     return result;

@@ -27,11 +27,14 @@ typedef struct {
 /* Takes a tuple: the class of a step's result; the forms of observations and of infos (see forms.h);
  * the shape and type of each array: those of observations and infos, then rewards, terminated,
  * truncated, mask and drawn values; and, for what infos tell of the episodes that start, the class
- * LateDict, the key of what fills it, and a function of drawn values and a mask that does so. Returns
+ * LateDict, the key of what fills it, and a function of drawn values and a mask that does so. None in
+ * the place of these three makes results of a single environment: numbers for arrays of one. Returns
  * NULL with an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 
+/* Whether they are of a single environment. */
+bool results_are_of_one(const Results *results);
 size_t results_number_of_seen(const Results *results);
 /* The bytes of an array. */
 size_t results_size(const Results *results, size_t array);

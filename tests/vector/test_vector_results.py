@@ -194,6 +194,7 @@ def test_results_that_fit_are_taken(monkeypatch):
         {"infos": ("ab",)},
         {"late": LATE[:2]},
         {"late": dict},
+        {"late": (None,) * 3},
     ],
 )
 def test_results_that_do_not_fit_are_refused(changes, monkeypatch):
