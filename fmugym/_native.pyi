@@ -219,7 +219,7 @@ class Pool:
         ended: Array,
         kept: Array,
         done: Array | None,
-        results: tuple[Any, ...] | None,
+        results: tuple[Any, ...],
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
@@ -281,15 +281,3 @@ class Pool:
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
-
-    def rollout(
-        self,
-        actions: Array,
-        observations: Array | tuple[Array, ...],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
-        offsets: Array,
-        /,
-    ) -> int:
-        """Do many steps with all that was taken over; see ``NativePool.roll_out``."""

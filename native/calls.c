@@ -72,15 +72,6 @@ size_t pool_play_after(Pool *pool, const Call *call, Ends *ends) {
     return troubled;
 }
 
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside) {
-    const size_t runs = (pool->settings.count + ROLLOUT_RUN - 1) / ROLLOUT_RUN;
-    Task task = {.pool = pool, .call = call, .operation = ROLLOUT, .horizon = horizon};
-    const size_t troubled = schedule_run(&task, runs);
-
-    *outside = atomic_get(&task.outside) != 0;
-    return troubled;
-}
-
 /* Stores the observations of all, as the program makes them. */
 static Verdict observe_all(const Pool *pool, const Turn *turn) {
     const size_t end = pool->settings.count;

@@ -31,9 +31,9 @@ WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t low
 ANY_NAN(double, is_any_nan, int64_t)
 ANY_NAN(float, is_any_nan32, int32_t)
 
-bool play_has_bad_action(const Turn *turn, size_t steps) {
+bool play_has_bad_action(const Turn *turn) {
     const Actions *a = &turn->play->actions;
-    const size_t count = steps * turn->play->count * a->elements;
+    const size_t count = turn->play->count * a->elements;
     const void *actions = turn->actions;
 
     switch (a->check) {
@@ -56,7 +56,7 @@ void play_draw(const Turn *turn, size_t index) {
     const Play *play = turn->play;
     double *values = turn->drawn + index;
 
-    if (turn->drawn == NULL) { /* as in rollouts: no episode that has ended is followed */
+    if (turn->drawn == NULL) { /* another thread has ended the episode since the call */
         return;
     }
     BitGenerator bits = bits_of(&play->streams[index]);

@@ -84,7 +84,6 @@ typedef struct {
 typedef struct {
     const Play *play;
     const char *actions;
-    const double *offsets; /* what is added to the outputs of each instance, or NULL */
     double *rewards;
     uint8_t *terminated, *truncated;
     char *const *seen; /* the arrays of the observations and infos that the judgement stores */
@@ -95,8 +94,8 @@ typedef struct {
     double *drawn; /* a row for each draw; only the values drawn in this step are written */
 } Turn;
 
-/* Whether an action of so many steps is out of range or NaN. */
-bool play_has_bad_action(const Turn *turn, size_t steps);
+/* Whether an action is out of range or NaN. */
+bool play_has_bad_action(const Turn *turn);
 
 /* Scratch memory of one thread. */
 typedef struct {

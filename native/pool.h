@@ -163,7 +163,7 @@ typedef struct {
     uint32_t calls;
 } Cost;
 
-enum { STEP, RESET, PLAY, RESTORE, ROLLOUT, BEFORE, AFTER, OPERATIONS };
+enum { STEP, RESET, PLAY, RESTORE, BEFORE, AFTER, OPERATIONS };
 
 typedef struct Pool {
     struct Pool *next; /* next in the list of all pools */
@@ -291,9 +291,6 @@ size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
 /* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
  * and sets outside if a hook looked up an index outside of a table. */
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
-
-/* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside);
 
 /* How many initializations all pools of this process have begun. */
 uint64_t number_of_initializations(void);

@@ -387,14 +387,6 @@ static size_t take_not_small(Task *task, size_t begin, size_t count, double *out
     return troubled;
 }
 
-static void add_offsets(const Turn *turn, size_t width, size_t count, double *outputs) {
-    for (size_t j = 0; turn != NULL && turn->offsets != NULL && j < count; j++) {
-        for (size_t i = 0; i < width; i++) {
-            outputs[j * width + i] += turn->offsets[i];
-        }
-    }
-}
-
 /* Steps or resets a run, and leaves the outputs in the scratch memory. For a single instance, a call
  * with so many arguments is a part of its step. */
 static ALWAYS_INLINE size_t advance(Task *task, size_t begin, size_t count, Scratch scratch,
@@ -405,7 +397,6 @@ static ALWAYS_INLINE size_t advance(Task *task, size_t begin, size_t count, Scra
     records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
     scratch.sound = are_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
-    add_offsets(task->call->turn, width, count, scratch.outputs);
     *fits_floats = all_within(scratch.outputs, count * width, FLOAT32_LIMIT);
     if (!*fits_floats) {
         troubled += take_not_small(task, begin, count, scratch.outputs);
@@ -464,7 +455,8 @@ static void replace_outputs(const Task *task, size_t begin, size_t count, const 
     }
 }
 
-size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
+/* Steps or resets one run, and runs the programs before and after. */
+static size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
     const Turn *turn = task->call->turn;
     Fresh fresh = {scratch.outputs, task->pool->settings.outputs->count, true};
     size_t troubled;

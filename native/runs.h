@@ -7,17 +7,11 @@
 #include "starts.h"
 #include "task.h"
 
-enum {
-    RUN = PROGRAM_WIDTH, /* number of instances in a run */
-    ROLLOUT_RUN = 64     /* in a rollout, where shorter runs keep more threads busy */
-};
+enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
 
 static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;
 }
-
-/* Steps or resets one run, and runs the programs before and after. */
-size_t run_turn(Task *task, PlayedRun run, Scratch scratch);
 
 /* All three work on the items from begin to end and return how many instances have a status
  * worse than a warning. This one resets or restores instances that need not be neighbours: */

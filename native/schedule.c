@@ -4,7 +4,7 @@
 #include <stdlib.h>
 
 #include "inside.h"
-#include "rollouts.h"
+#include "runs.h"
 #include "threads.h"
 
 /* All in ns. */
@@ -23,7 +23,7 @@ enum {
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 
-    if (task->operation == ROLLOUT || task->operation == BEFORE) { /* the caller knows what to do */
+    if (task->operation == BEFORE) { /* the caller knows what to do */
         return end - begin;
     }
     for (size_t i = begin; i < end; i++) {
@@ -52,9 +52,6 @@ static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
     if (task->listed) {
         return run_listed(task, begin, end, scratch);
     }
-    if (task->operation == ROLLOUT) {
-        return run_rollout(task, begin, end, scratch);
-    }
     if (task->operation == BEFORE) {
         return run_before(task, begin, end);
     }
@@ -63,13 +60,9 @@ static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
                : run_steps(task, begin, end, scratch);
 }
 
-static size_t length_of_longest_run(const Task *task, size_t begin, size_t end) {
-    return task->listed ? 0 : task->operation == ROLLOUT ? ROLLOUT_RUN : length_of_run(begin, end);
-}
-
 static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     const Settings *s = &task->pool->settings;
-    const size_t most = most_values(task), run = length_of_longest_run(task, begin, end);
+    const size_t most = most_values(task), run = task->listed ? 0 : length_of_run(begin, end);
     const size_t in = run * s->inputs->count, out = run * s->outputs->count;
     const size_t size = 2 * most + in + out;
     double stack[STACK_VALUES];

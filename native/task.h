@@ -13,7 +13,6 @@ typedef struct {
     int operation;
     const Snapshot *snapshot; /* the snapshot to restore */
     const State *states;      /* or a state for each place in pool->chosen */
-    size_t horizon;           /* the steps of a rollout, whose items are runs */
     bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */

@@ -245,11 +245,6 @@ class Pool(ABC):
         """Whether the pool steps and starts the FMUs itself in a step with programs."""
         return False
 
-    @property
-    def rolls_out(self) -> bool:
-        """Whether ``roll_out`` does many steps with programs in one call."""
-        return self.plays_alone
-
     def extract(self) -> bool:
         """Extract the FMU's files anew that have been removed; returns whether there were any.
 
@@ -270,14 +265,6 @@ class Pool(ABC):
 
         Raises:
             SimulationError: If the pool does not support it.
-        """
-        raise SimulationError(f"a {type(self).__name__} cannot run programs")
-
-    def roll_out(self, *arrays: Any) -> int:
-        """Do many steps of the prepared play in one call; see ``NativePool``.
-
-        Raises:
-            SimulationError: If the pool does not support it; see ``rolls_out``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run programs")
 

@@ -71,7 +71,6 @@ class Arrays(NamedTuple):
     Attributes:
         mask: Which instances not to step, shape (N,).
         counts: What each instance does, shape (N, HEALTH_COUNTS).
-        progress: The steps of each episode in a rollout, shape (N,).
     """
 
     inputs: FloatArray
@@ -80,7 +79,6 @@ class Arrays(NamedTuple):
     statuses: StatusArray
     mask: MaskArray
     counts: HealthArray
-    progress: npt.NDArray[np.int64]
 
 
 def layout_of(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
@@ -92,7 +90,6 @@ def layout_of(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
         ((count,), np.int8),
         ((count,), np.bool_),
         ((count, HEALTH_COUNTS), np.int64),
-        ((count,), np.int64),
     ]
 
 

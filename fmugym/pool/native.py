@@ -307,18 +307,6 @@ class NativePool(AskingPool):
         step, reset = self._starting_play
         return Play(pool.check_actions, pool.play_before, pool.play_after, pool.play, step, reset)
 
-    def roll_out(self, *arrays: Any) -> int:
-        """Do many steps of the prepared play in one call; episodes that end are not followed.
-
-        Args:
-            arrays: Actions, observations, rewards, terminated and truncated of steps, each with a
-                first axis for the steps; and what is added to each output, or nothing, float64.
-
-        Returns:
-            How many instances or numbers were in trouble; if there are any, not all steps are done.
-        """
-        return self._open_pool().rollout(*arrays)
-
 
 def prepare(
     pool: _native.Pool,
@@ -354,13 +342,13 @@ def prepare(
             task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
             they were before the step; ``drawn_variables``, rows and the numbers of their draws;
             ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
-            each input the number of a start value, or -1 and a constant. ``results``, None if
-            only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
-            tuple; the forms of observations and of infos, each the number of an array, or a
-            tuple of names and forms; the shape and type of each array: float32 observations, or
-            those that the second program stores, then rewards, terminated and truncated of a
-            step, mask and drawn values (draws, N) of a reset; and a function of drawn values
-            and a mask, which returns what infos tell of the episodes that start.
+            each input the number of a start value, or -1 and a constant. ``results``, a tuple of
+            ``numpy.empty``; the class of a step's result, a tuple; the forms of observations and of
+            infos, each the number of an array, or a tuple of names and forms; the shape and type of
+            each array: float32 observations, or those that the second program stores, then rewards,
+            terminated and truncated of a step, mask and drawn values (draws, N) of a reset; and a
+            function of drawn values and a mask, which returns what infos tell of the episodes that
+            start.
     """
     counts, ended, limit = episodes
     rows = Rows()

@@ -55,8 +55,7 @@ class Request(IntEnum):
     COUNT_STEPS = 11
     FAILURE = 12
     DIFFERENTIATE = 13
-    ROLL_OUT = 14
-    CLOSE = 15
+    CLOSE = 14
 
 
 class Answer(IntEnum):

@@ -143,13 +143,6 @@ class Episodes:
         """Let each environment play the candidate at its place."""
         engine, actions = self._engine, candidates.actions(places)
         self._begin(start, places, candidates)
-        if actions is not None:
-            engine.has_moved = False
-            arrays = engine.roll_out(actions)
-            if arrays is not None:
-                return Rollout.of(*arrays)
-            if engine.has_moved:  # a step has failed: the engine knows what follows
-                self._begin(start, places, candidates)
         first = None if actions is not None else engine.observe(self._everywhere)
         return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
 

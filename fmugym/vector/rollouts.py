@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -78,7 +79,7 @@ class Rollout(_Steps):
         terminated: MaskArray,
         truncated: MaskArray,
         costs: Mapping[str, FloatArray],
-        has_failed: Any = False,
+        has_failed: MaskArray,
     ) -> Rollout:
         """Make it of arrays with steps on the first axis."""
         ends = terminated | truncated
@@ -89,7 +90,7 @@ class Rollout(_Steps):
         runs = np.arange(horizon)[:, np.newaxis] < lengths
         found = cls(turned, rewards.T, terminated.T, truncated.T, lengths)
         found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
-        found.has_failed = np.broadcast_to(has_failed, lengths.shape)
+        found.has_failed = has_failed
         return found
 
 
@@ -97,7 +98,7 @@ def costs_in(infos: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Floa
     """The costs that infos of environments tell, by name.
 
     Args:
-        infos: Those of a step, or of all steps of a rollout.
+        infos: Those of a step.
         shape: That of the rewards. What a class tells as ``"costs"`` in another shape, or as no
             numbers, is its own affair.
     """
@@ -112,11 +113,6 @@ def costs_in(infos: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Floa
     }
 
 
-def _names(costs: Iterable[Mapping[str, FloatArray]]) -> list[str]:
-    """The names of costs, some of which a step with a fault may not tell."""
-    return list(dict.fromkeys(name for told in costs for name in told))
-
-
 def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
     """Put rollouts together, and keep the first candidates."""
     if len(parts) == 1 and len(parts[0].rewards) == count:
@@ -127,7 +123,7 @@ def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
     )
     joined.costs = {
         name: np.concatenate([one.costs.get(name, 0.0 * one.rewards) for one in parts])[:count]
-        for name in _names(one.costs for one in parts)
+        for name in dict.fromkeys(name for one in parts for name in one.costs)
     }
     joined.has_failed = np.concatenate([one.has_failed for one in parts])[:count]
     return joined
@@ -349,35 +345,85 @@ def _in_words_of_candidates(error: ConfigError, space: Any, array: npt.NDArray[A
     return error
 
 
+class _Arrays:
+    """What the steps of a rollout lead to, in arrays with the steps on the first axis.
+
+    Args:
+        horizon: The number of steps.
+        count: N.
+    """
+
+    def __init__(self, horizon: int, count: int) -> None:
+        self._horizon = horizon
+        self._observations: Any = None
+        self._rewards = np.zeros((horizon, count))
+        self._terminated, self._truncated = np.zeros((2, horizon, count), np.bool_)
+        self._costs: dict[str, FloatArray] = {}
+        self._has_failed = np.zeros(count, np.bool_)
+
+    def keep(self, step: int, result: StepResult, resting: MaskArray | None) -> None:
+        """Copy the result of a step, in which some candidates rest because they have ended."""
+        if step == 0:
+            self._observations = mapped(self._room_for, result.observations)
+        if type(result.observations) is np.ndarray:  # no tree to search through
+            self._observations[step] = result.observations
+        else:
+            mapped(partial(_put, step), self._observations, result.observations)
+        self._rewards[step] = result.rewards
+        self._terminated[step] = result.terminated
+        self._truncated[step] = result.truncated
+        if result.infos:
+            self._keep_infos(step, result.infos, resting)
+
+    def _keep_infos(self, step: int, infos: Mapping[str, Any], resting: MaskArray | None) -> None:
+        for name, paid in costs_in(infos, self._has_failed.shape).items():
+            if name not in self._costs:
+                self._costs[name] = np.zeros_like(self._rewards)
+            self._costs[name][step] = paid
+        if "_fault" in infos:
+            self._has_failed |= infos["_fault"] if resting is None else infos["_fault"] & ~resting
+
+    def _room_for(self, part: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.empty((self._horizon, *part.shape), part.dtype)
+
+    def repeat_last(self, step: int) -> None:
+        """Let nothing happen from a step on."""
+        mapped(lambda rows: _put(slice(step, None), rows, rows[step - 1]), self._observations)
+
+    def rollout(self) -> Rollout:
+        """The rollout of these steps."""
+        judged = self._rewards, self._terminated, self._truncated
+        return Rollout.of(self._observations, *judged, self._costs, self._has_failed)
+
+
+def _put(step: int | slice, rows: npt.NDArray[Any], part: npt.NDArray[Any]) -> None:
+    rows[step] = part
+
+
 def roll_out_by_steps(
     engine: Engine, act: Callable[[int, Any], Any], horizon: int, observations: Any
 ) -> Rollout:
-    """Roll out with one call of the engine for each step.
+    """Roll out with one call of the engine for each step, until all candidates have ended.
 
     Args:
-        engine: Its episodes are at their present places.
+        engine: Its episodes are at their present places, and none has ended.
         act: Returns the actions of all environments, from the number of the step and the
             observations before it.
         horizon: The number of steps.
         observations: The observations before the first step.
     """
-    over, has_failed = np.zeros((2, len(engine.ended)), np.bool_)
-    results: list[StepResult] = []
+    arrays = _Arrays(horizon, len(engine.ended))
     for step in range(horizon):
-        resting = over.copy() if np.count_nonzero(over) else None
+        resting = engine.ended.copy() if engine.any_ended else None
+        if resting is not None and resting.all():
+            arrays.repeat_last(step)
+            break
         result = engine.step(act(step, observations), None, resting)
         if resting is not None:
             result = _without(result, observations, resting)
-        has_failed |= result.infos.get("_fault", False) & ~over
-        over |= result.terminated | result.truncated
+        arrays.keep(step, result, resting)
         observations = result.observations
-        results.append(result)
-    costs = [costs_in(result.infos, result.rewards.shape) for result in results]
-    seen, rewards, terminated, truncated = mapped(
-        lambda *arrays: np.stack(arrays), *(result[:4] for result in results)
-    )
-    paid = {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in _names(costs)}
-    return Rollout.of(seen, rewards, terminated, truncated, paid, has_failed)
+    return arrays.rollout()
 
 
 def _without(result: StepResult, before: Any, over: MaskArray) -> StepResult:

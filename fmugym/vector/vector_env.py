@@ -416,8 +416,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """Find out what candidates for the next actions would lead to.
 
         The environments return to their present episodes afterwards, if they have any. Hooks are
-        included. Where these are expressions, one call of the C extension does all steps on all
-        threads.
+        included.
 
         Args:
             snapshot: Where the candidates begin: a snapshot of one environment, or of one for each

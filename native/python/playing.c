@@ -168,7 +168,7 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
 }
 
 bool pool_observes(const Playing *playing) {
-    return playing->form.judgement.program.number_of_seen == 0 && playing->results != NULL &&
+    return playing->form.judgement.program.number_of_seen == 0 &&
            results_number_of_seen(playing->results) == 1;
 }
 
@@ -194,9 +194,6 @@ static bool results_fit(const PyPool *self, const Playing *playing) {
 }
 
 static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
-    if (parts == Py_None) {
-        return true;
-    }
     playing->results = results_take(parts);
     if (playing->results != NULL && !results_fit(self, playing)) {
         PyErr_SetString(PyExc_ValueError, "the arrays of results do not fit the pool");

@@ -28,7 +28,7 @@ typedef struct {
     Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;
-    Results *results; /* NULL if only rollouts follow */
+    Results *results;
 } Playing;
 
 /* Of a capsule that prepare_play has made. */
@@ -39,19 +39,8 @@ bool pool_observes(const Playing *playing);
 
 /* One call that plays: */
 
-enum {
-    ACTIONS,
-    SEEN,
-    REWARDS,
-    TERMINATED,
-    TRUNCATED,
-    TURN_BUFFERS
-};
-
 typedef struct {
-    Py_buffer buffers[TURN_BUFFERS];
-    Py_buffer seen_buffers[MOST_SEEN];
-    char *seen[MOST_SEEN];
+    Py_buffer actions;
     size_t seen_sizes[MOST_SEEN];
     Turn turn;
     Call call;
@@ -61,27 +50,17 @@ typedef struct {
     Ends ends;
 } PyTurn;
 
-/* Takes memory that must have so many bytes, whatever its items are. */
-bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size);
-
 /* Takes an array of actions, or the action of the only environment: an array, or an integer. Those of
  * another type or shape come back as an exception; the caller then converts them. */
 bool take_actions_of_turn(const Playing *playing, PyObject *actions, PyTurn *t);
 
-/* Clears what is used of the many buffers. */
-void clear_turn(const Playing *playing, PyTurn *t);
-void release_turn(const Playing *playing, PyTurn *t);
-
-/* Lets the turn and its call refer to the buffers. */
+/* Lets the turn and its call refer to what was prepared and to the actions, if there are any. */
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t);
-/* Lets the step fill the arrays that it returns. */
-void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t);
 
 /* Whether a hook looked up an index outside of a table, which is an exception. */
 bool is_outside(const PyTurn *t);
 
-/* Both return false with an exception if nothing is prepared, or only rollouts. */
+/* Returns false with an exception if nothing is prepared. */
 bool is_prepared(const PyPool *self);
-bool has_results(const PyPool *self);
 
 #endif

@@ -5,18 +5,6 @@
 #include <stdint.h>
 #include <string.h>
 
-/* For arrays that the caller has just made. To tell their types, numpy would describe them in text,
- * which takes as long as all other checks together. */
-bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
-    if (PyObject_GetBuffer(object, buffer, PyBUF_C_CONTIGUOUS | flags) < 0) {
-        return false;
-    }
-    if ((size_t)buffer->len != size) {
-        PyErr_Format(PyExc_ValueError, "an array has %zd bytes, expected %zu", buffer->len, size);
-    }
-    return (size_t)buffer->len == size;
-}
-
 /* Whether the items of a buffer are of numpy's type with this letter; it has two for int64. */
 static bool has_letter(const Py_buffer *buffer, int letter) {
     const char *format = buffer->format == NULL ? "B" : buffer->format;
@@ -54,7 +42,7 @@ static bool take_integer(PyObject *action, PyTurn *t) {
     PyObject *integer = PyBool_Check(action) ? NULL : PyNumber_Index(action);
 
     t->number = integer == NULL ? 0 : PyLong_AsLongLong(integer);
-    t->buffers[ACTIONS].buf = &t->number;
+    t->actions.buf = &t->number;
     Py_XDECREF(integer);
     if (integer == NULL || PyErr_Occurred()) {
         PyErr_SetString(PyExc_TypeError, "the action is no integer of 64 bits");
@@ -68,20 +56,15 @@ bool take_actions_of_turn(const Playing *playing, PyObject *actions, PyTurn *t) 
 
     return is_discrete && is_of_one(playing) && !PySequence_Check(actions)
                ? take_integer(actions, t)
-               : take_array(playing, actions, &t->buffers[ACTIONS]);
+               : take_array(playing, actions, &t->actions);
 }
 
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
-    const Py_buffer *b = t->buffers;
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
 
     t->turn = (Turn){
         .play = &playing->form.play,
-        .actions = b[ACTIONS].buf,
-        .rewards = b[REWARDS].buf,
-        .terminated = b[TERMINATED].buf,
-        .truncated = b[TRUNCATED].buf,
-        .seen = t->seen,
+        .actions = t->actions.buf,
         .seen_sizes = t->seen_sizes,
     };
     t->call = (Call){
@@ -89,7 +72,6 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .start = &((PyAccess *)playing->start)->access,
         .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
         .mask = {(const char *)playing->form.play.ended, 1},
-        .observations = b[SEEN].buf,
         .turn = &t->turn,
     };
 }
@@ -98,7 +80,7 @@ static void do_play(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
 
     t->call.alone = alone;
-    t->bad_action = play_has_bad_action(&t->turn, 1);
+    t->bad_action = play_has_bad_action(&t->turn);
     if (!t->bad_action) {
         t->troubled = pool_play(&self->pool, &t->call, &t->ends);
     }
@@ -109,7 +91,7 @@ static void do_before(PyPool *self, bool alone, void *context) {
 
     t->call.alone = alone;
     t->ends.outside = false;
-    t->bad_action = play_has_bad_action(&t->turn, 1);
+    t->bad_action = play_has_bad_action(&t->turn);
     if (!t->bad_action) {
         t->troubled = pool_play_before(&self->pool, &t->call);
     }
@@ -129,7 +111,8 @@ bool is_outside(const PyTurn *t) {
     return t->ends.outside;
 }
 
-void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+/* Lets the step fill the arrays that it returns. */
+static void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
     t->turn.rewards = (double *)(void *)arrays->memory[REWARDS_ARRAY];
     t->turn.terminated = (uint8_t *)arrays->memory[TERMINATED_ARRAY];
     t->turn.truncated = (uint8_t *)arrays->memory[TRUNCATED_ARRAY];
@@ -194,35 +177,17 @@ static bool play_turn(PyPool *self, int operation, PyTurn *t) {
     return !is_outside(t) && report_messages(self);
 }
 
-void clear_turn(const Playing *playing, PyTurn *t) {
-    const size_t size = playing->form.judgement.program.number_of_seen * sizeof(Py_buffer);
-
-    t->bad_action = false;
-    memset(t->buffers, 0, sizeof t->buffers);
-    memset(t->seen_buffers, 0, size);
-}
-
-void release_turn(const Playing *playing, PyTurn *t) {
-    for (int i = 0; i < TURN_BUFFERS; i++) {
-        release_buffer(&t->buffers[i]);
-    }
-    for (size_t i = 0; i < playing->form.judgement.program.number_of_seen; i++) {
-        release_buffer(&t->seen_buffers[i]);
-    }
-}
-
 /* What comes before the FMUs' part fills nothing that it returns. */
 static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *actions) {
     const Playing *playing = playing_of(capsule);
-    PyTurn t;
+    PyTurn t = {.bad_action = false};
     bool done = false;
 
-    clear_turn(playing, &t);
     if (take_actions_of_turn(playing, actions, &t)) {
         settle_turn(self, playing, &t);
         done = play_turn(self, BEFORE, &t);
     }
-    release_turn(playing, &t);
+    release_buffer(&t.actions);
     return done ? Py_NewRef(Py_None) : NULL;
 }
 
@@ -252,17 +217,16 @@ static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObj
     const bool starts =
         operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
     ResultArrays arrays;
-    PyTurn t;
+    PyTurn t = {.bad_action = false};
     PyObject *result = NULL;
 
-    clear_turn(playing, &t);
     if (provide(playing->results, starts, at_ends, &arrays) &&
         take_actions_of_turn(playing, actions, &t)) {
         settle_step(self, playing, starts, at_ends, &arrays, &t);
         result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }
     results_drop(playing->results, &arrays);
-    release_turn(playing, &t);
+    release_buffer(&t.actions);
     return result;
 }
 
@@ -273,20 +237,11 @@ bool is_prepared(const PyPool *self) {
     return self->playing != NULL;
 }
 
-bool has_results(const PyPool *self) {
-    const Playing *playing = playing_of(self->playing);
-
-    if (playing->results == NULL) {
-        PyErr_SetString(PyExc_ValueError, "play was prepared without results");
-    }
-    return playing->results != NULL;
-}
-
 /* Keeps what was prepared alive while it plays. */
 static PyObject *play_by(PyObject *object, int operation, PyObject *actions, bool at_ends) {
     PyPool *self = (PyPool *)object;
 
-    if (!is_prepared(self) || !has_results(self)) {
+    if (!is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
@@ -300,23 +255,22 @@ static PyObject *play_by(PyObject *object, int operation, PyObject *actions, boo
 /* Nothing but the check of the actions that every step begins with. */
 PyObject *py_check_actions(PyObject *object, PyObject *actions) {
     PyPool *self = (PyPool *)object;
-    PyTurn t;
+    PyTurn t = {.bad_action = false};
 
     if (!is_prepared(self)) {
         return NULL;
     }
     PyObject *capsule = Py_NewRef(self->playing);
     const Playing *playing = playing_of(capsule);
-    clear_turn(playing, &t);
     bool good = take_actions_of_turn(playing, actions, &t);
     if (good) {
         settle_turn(self, playing, &t);
-        good = !play_has_bad_action(&t.turn, 1);
+        good = !play_has_bad_action(&t.turn);
         if (!good) {
             raise_bad_action();
         }
     }
-    release_turn(playing, &t);
+    release_buffer(&t.actions);
     Py_DECREF(capsule);
     return good ? Py_NewRef(Py_None) : NULL;
 }

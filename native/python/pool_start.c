@@ -59,10 +59,9 @@ static PyObject *reset_result(const Playing *playing, const ResultArrays *arrays
 static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
     const Playing *playing = playing_of(capsule);
     ResultArrays arrays;
-    PyTurn t;
+    PyTurn t = {.bad_action = false};
     PyObject *result = NULL;
 
-    clear_turn(playing, &t);
     if (results_provide_reset(playing->results, &arrays)) {
         if (!results_copy_mask(playing->results, mask, &arrays)) {
             result = Py_NewRef(Py_None);
@@ -80,7 +79,7 @@ static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
 PyObject *py_reset_by(PyObject *object, PyObject *options) {
     PyPool *self = (PyPool *)object;
 
-    if (!is_prepared(self) || !has_results(self)) {
+    if (!is_prepared(self)) {
         return NULL;
     }
     PyObject *mask = mask_of(options);

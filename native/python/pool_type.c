@@ -124,7 +124,6 @@ static PyMethodDef methods[] = {
     {"check_actions", py_check_actions, METH_O, NULL},
     {"play_before", py_play_before, METH_O, NULL},
     {"play_after", py_play_after, METH_O, NULL},
-    FAST("rollout", py_rollout),
     {"reset_by", py_reset_by, METH_O, NULL},
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),

@@ -126,7 +126,6 @@ static void read_places(Worker *w, Reader *reader, size_t first) {
     shared->statuses = place(reader, shared, 1, first, n);
     shared->mask = place(reader, shared, 1, first, n);
     shared->health = place(reader, shared, sizeof(int64_t) * HEALTH_COUNTS, first, n);
-    shared->progress = place(reader, shared, sizeof(int64_t), first, n);
     const size_t echo_size = (size_t)read_integer_in(reader, 8, UINT16_MAX);
     char *echo = place(reader, shared, 1, 0, echo_size);
     const Atomic *bell = place(reader, shared, sizeof(Atomic), 0, 1);

@@ -30,11 +30,10 @@ static Answer answer_close(Worker *w) {
 }
 
 static Answer answer_in_pool(Worker *w, Request request, Reader *reader, Writer *writer) {
-    return request == REQUEST_RESET      ? answer_reset(w, reader, writer)
-           : request == REQUEST_SAVE     ? answer_save(w, reader, writer)
-           : request == REQUEST_RESTORE  ? answer_restore(w, reader, writer)
-           : request == REQUEST_RELEASE  ? answer_release(w, reader)
-           : request == REQUEST_ROLL_OUT ? answer_roll_out(w, reader, writer)
+    return request == REQUEST_RESET     ? answer_reset(w, reader, writer)
+           : request == REQUEST_SAVE    ? answer_save(w, reader, writer)
+           : request == REQUEST_RESTORE ? answer_restore(w, reader, writer)
+           : request == REQUEST_RELEASE ? answer_release(w, reader)
            : request == REQUEST_CLOSE
                ? answer_close(w)
                : pool_answer(&w->pool, shared_inputs(w), request, reader, writer);

@@ -16,7 +16,7 @@ typedef struct {
     float *observations;
     int8_t *statuses;
     const char *mask;
-    int64_t *health, *progress;
+    int64_t *health;
 } Shared;
 
 /* A list of variables that are set before initialization, and its form. */
@@ -25,8 +25,6 @@ typedef struct {
     size_t size;
     Access access;
 } List;
-
-typedef struct Rolling Rolling;
 
 typedef struct {
     Channel channel;
@@ -42,7 +40,6 @@ typedef struct {
     size_t number_of_lists;
     Snapshot **snapshots; /* NULL for those that were freed */
     size_t number_of_snapshots;
-    Rolling *rolling;     /* what surrounds the steps of rollouts, or NULL */
     int64_t resets;       /* of single instances */
     int64_t first_memory; /* bytes of the process after the first resets; 0 before */
 } Worker;
@@ -59,7 +56,6 @@ Answer answer_reset(Worker *worker, Reader *reader, Writer *writer);
 Answer answer_save(Worker *worker, Reader *reader, Writer *writer);
 Answer answer_restore(Worker *worker, Reader *reader, Writer *writer);
 Answer answer_release(Worker *worker, Reader *reader);
-Answer answer_roll_out(Worker *worker, Reader *reader, Writer *writer);
 
 /* Passes on the messages of the FMUs. */
 void worker_report(Worker *worker);

@@ -11,7 +11,7 @@ import pytest
 import zoo_tools
 from combinations import in_turn
 from process_tools import run_python
-from program_tools import DISCRETE, code, uniform_draws
+from program_tools import DISCRETE, code, results_of, uniform_draws
 from test_native_pool import LOG, make, on_linux
 from ways import in_way
 
@@ -214,12 +214,12 @@ def surroundings(pool):
         "drawn_variables": (),
         "variable_starts": (),
         "input_starts": ((-1, 0.0),) * len(pool.inputs),
-        "results": None,
     }
 
 
 def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):
     n = pool.num_instances
+    results = results_of(n, pool.observations.shape[1], len(rows))
     return pool.prepare_play(
         (pool.variable("theta_0"),),
         (inputs, judgement or program(results=(0, 0, 0))),
@@ -227,7 +227,7 @@ def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):
         np.zeros((1, n)),
         draws or (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
         (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
-        surroundings(pool) | changes,
+        surroundings(pool) | {"results": results} | changes,
     )
 
 

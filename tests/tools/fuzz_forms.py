@@ -24,7 +24,7 @@ from unittest import mock
 import numpy as np
 from fuzz_driver import Case, main, require
 from pool_tools import sampled
-from program_tools import code, constants, uniform_draws
+from program_tools import code, constants, results_of, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.expressions.program import SLOT
@@ -231,7 +231,7 @@ def play_of(inputs, outputs):
         "drawn_variables": (),
         "variable_starts": ((variables[0], np.float64(2.0).tobytes()),),
         "input_starts": ((-1, 0.5),),
-        "results": None,
+        "results": results_of(N, 1, 0),
     }
     actions = {
         "shape": (),
@@ -249,12 +249,6 @@ def play_of(inputs, outputs):
     return programs, actions, np.zeros((0, N)), streams, episodes, surroundings
 
 
-def rolled():
-    """The arrays of a rollout of three steps."""
-    flags = np.zeros((3, N), np.bool_), np.zeros((3, N), np.bool_)
-    return np.zeros((3, N)), np.zeros((3, N, 1), np.float32), np.zeros((3, N)), *flags
-
-
 def play_form(rng):
     """Its instances are elsewhere, so that none steps."""
     fmu, *_ = opened()[1]
@@ -266,7 +260,9 @@ def play_form(rng):
         parts, form = play_of(*own[:2]), lambda *a: damaged(rng, form_of_play(*a))
         with mock.patch.object(native, "form_of_play", form), refusals():
             prepare(pool, _native.Access(form_of_listing(())), *parts)
-            pool.rollout(*rolled())
+            for _ in range(3):
+                pool.play_before(np.zeros(N))
+                pool.play_after(np.zeros(N))
 
     return Case(play, "play")
 
@@ -343,12 +339,6 @@ def restore_states(rng, pool, kept):
         pool.restore_states(kept["states"], np.arange(N))
 
 
-def roll_out(rng, pool, kept):
-    with refusals():
-        pool.prepare_play((), *play_of(pool.inputs, pool.outputs))
-        pool.roll_out(*rolled())
-
-
 def read(rng, pool, kept):
     pool.read((variable("x"),))
 
@@ -367,7 +357,7 @@ def ask(rng, pool, kept):
 
 
 ACTIONS = step, step, reset, save, restore, save_states, restore_states, read, write, ask
-ACTIONS += (differentiate, roll_out)
+ACTIONS += (differentiate,)
 FAULT = re.compile(r"ended with (signal (?!SIGKILL)|exit status [1-9])")
 
 

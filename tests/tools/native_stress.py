@@ -30,7 +30,7 @@ from pathlib import Path
 
 import numpy as np
 from exchange_tools import exchange_fmu
-from program_tools import DISCRETE, code, constants, uniform_draws
+from program_tools import DISCRETE, code, constants, results_of, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.expressions.program import TYPES
@@ -38,7 +38,6 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
-from fmugym.task.values import UNFILLED, LateDict
 
 THREADS = 6
 LONGEST_WAIT = 120.0
@@ -72,11 +71,6 @@ def programs(pool, variables):
 
 
 DRAWS = uniform_draws(0)
-
-
-def tell(drawn, mask):
-    """What a reset tells of the episodes that it starts."""
-    return {"drawn": drawn * mask}
 
 
 class ReceiverError(Exception):
@@ -170,14 +164,9 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (tuple, 0, (), self.results(), (LateDict, UNFILLED, tell)),
+                "results": results_of(self.n, len(self.outputs), 1),
             },
         )
-
-    def results(self):
-        """The shapes and types of what a step or a reset returns."""
-        flags, seen = ((self.n,), bool), ((self.n, len(self.outputs)), np.float32)
-        return seen, ((self.n,), float), flags, flags, flags, ((1, self.n), float)
 
     def draw(self):
         """Seed streams and draw from them while other threads play."""
@@ -228,16 +217,6 @@ class Subject:
     def write(self):
         self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))
 
-    def roll_out(self):
-        horizon = int(self.rng.integers(1, 6))
-        shape = horizon, self.n
-        flags = np.empty(shape, np.bool_), np.empty(shape, np.bool_)
-        observations = np.empty((*shape, len(self.outputs)), np.float32)
-        actions = self.rng.integers(0, 2, shape)
-        with contextlib.suppress(ValueError):  # there may be nothing prepared
-            self.pool.roll_out(actions, observations, np.empty(shape), *flags, np.empty(0))
-            counts["rolled out"] += 1
-
     def forget(self):
         self.snapshot = None
 
@@ -270,11 +249,11 @@ ACTIONS = (
         "health",
     ),
     "close",
-    *("bundle", "unbundle", "unbundle", "write", "roll_out", "roll_out"),
+    *("bundle", "unbundle", "unbundle", "write"),
 )
 
 
-IN_TURN = {"play", "prepare_play", "reset_by", "roll_out"} if "in-turn" in sys.argv else set()
+IN_TURN = {"play", "prepare_play", "reset_by"} if "in-turn" in sys.argv else set()
 
 
 class Ring:

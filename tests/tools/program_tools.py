@@ -5,6 +5,7 @@ import numpy as np
 from fmugym import _native
 from fmugym.expressions.program import CONSTANT, OPERATIONS
 from fmugym.pool.form import form_of_draws
+from fmugym.task.values import UNFILLED, LateDict
 
 DISCRETE = {
     "shape": (),
@@ -37,3 +38,15 @@ def uniform_draws(*rows):
     kind = _native.distributions().index("uniform")
     table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
     return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
+
+
+def results_of(count, observed, draws):
+    """The form of what a step returns: a tuple, with so many observed outputs and draws."""
+    flags, seen = ((count,), bool), ((count, observed), np.float32)
+    arrays = seen, ((count,), float), flags, flags, flags, ((draws, count), float)
+    return tuple, 0, (), arrays, (LateDict, UNFILLED, _tell)
+
+
+def _tell(drawn, mask):
+    """What infos tell of the episodes that start."""
+    return {"drawn": drawn * mask}

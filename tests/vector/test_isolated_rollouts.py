@@ -1,7 +1,5 @@
-"""Rollouts with FMUs in worker processes, which do all steps of their environments."""
+"""Rollouts with FMUs in worker processes."""
 
-import os
-import signal
 from functools import partial
 
 import numpy as np
@@ -14,7 +12,6 @@ from ways import in_way
 
 import fmugym
 from fmugym import FMUVectorEnv
-from fmugym.vector import episodes
 
 N, HORIZON = 7, 25
 
@@ -28,16 +25,6 @@ def fixture_make(opened):
         return opened(FMUVectorEnv(in_way(way, cls), num_envs, **options))
 
     return make
-
-
-@pytest.fixture(name="in_workers")
-def fixture_in_workers(monkeypatch):
-    """Nothing goes step by step through this process."""
-
-    def refuse(*_):
-        raise AssertionError("a rollout goes step by step")
-
-    monkeypatch.setattr(episodes, "roll_out_by_steps", refuse)
 
 
 def begun(envs, steps=2):
@@ -59,7 +46,6 @@ TASKS = {
 }
 
 
-@pytest.mark.usefixtures("in_workers")
 @pytest.mark.parametrize("cls", TASKS.values(), ids=TASKS)
 def test_results_are_those_of_one_process(make, cls):
     """To the last bit; the episodes go on afterwards."""
@@ -74,18 +60,6 @@ def test_results_are_those_of_one_process(make, cls):
     for ours, theirs in zip(*results, strict=True):
         for one, other in zip(ours, theirs, strict=True):
             require_equal(one, other)
-
-
-@pytest.mark.usefixtures("in_workers")
-def test_a_new_worker_gets_the_programs(make):
-    envs = make(TASKS["cart-pole"])
-    actions = begun(envs)
-    expected = envs.rollout(None, actions)
-    os.kill(envs.inside.pool.processes()[1], signal.SIGKILL)
-    envs.step(actions[:, 0])
-    begun(envs)
-    for ours, theirs in zip(envs.rollout(None, actions), expected, strict=True):
-        require_equal(ours, theirs)
 
 
 def faulty(path, **foreign):
@@ -135,7 +109,6 @@ def test_a_hang_ends_after_the_time_limit_of_a_call(make, tmp_path):
     assert envs.inside.pool.health()["deaths"][1] > 0
 
 
-@pytest.mark.usefixtures("in_workers")
 def test_a_rollout_may_take_longer_than_a_call(make, tmp_path):
     """Three steps take 0.2 s each; one call may take 0.35 s."""
     path = faulty_fmu(tmp_path)

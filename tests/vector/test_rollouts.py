@@ -140,6 +140,22 @@ class TestValues:
                     assert reward == found.rewards[index, step]
 
 
+def test_a_policy_is_not_asked_once_all_have_ended(vector_of):
+    asked = []
+
+    def policy(observations):
+        asked.append(len(observations))
+        return np.zeros((N, 1), np.float32)
+
+    envs = vector_of(Track, N)
+    envs.reset(seed=2)
+    found = envs.rollout(None, policy, horizon=20)
+    assert found.lengths.tolist() == [12] * N
+    assert asked == [N] * 12
+    assert (found.observations[:, 12:] == found.observations[:, 11:12]).all()
+    assert not found.rewards[:, 12:].any()
+
+
 def test_from_one_root_no_state_is_serialized(monkeypatch, vector_of):
     """Planning costs one saved state, however many candidates there are."""
     env, envs = halfway(), vector_of(Track, N)

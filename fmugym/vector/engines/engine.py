@@ -250,19 +250,6 @@ class Engine(ABC):
             parameters: Those of parameters, arrays of shape (N,) by name.
         """
 
-    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
-        """Do many steps in one call; nobody needs the episodes afterwards.
-
-        Args:
-            actions: Shape (horizon, N, ...), checked, of the type of the action space.
-
-        Returns:
-            Observations, rewards, terminated, truncated, and costs by name, each with the steps on
-            the first axis; see ``Rollout`` for what follows an end. None if the engine cannot do
-            it, or if a step has failed.
-        """
-        return None
-
     @abstractmethod
     def observe(self, indices: IndexArray) -> Any:
         """The observations of all environments; those of the given ones may have changed."""

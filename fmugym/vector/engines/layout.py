@@ -38,15 +38,6 @@ class Layout:
         observations, infos = self._nested(range(len(self._paths)))
         self.form = _pairs(observations), _pairs(infos)
 
-    def of_steps(self, steps: int) -> tuple[Any, Any, dict[str, Any]]:
-        """Make the arrays of many steps, which are the first axis.
-
-        Returns:
-            The arrays, or the only one; and the observations and infos that they hold.
-        """
-        arrays = tuple(np.empty((steps, *shape), dtype) for shape, dtype in self.shapes)
-        return arrays[0] if len(arrays) == 1 else arrays, *self._nested(arrays)
-
     def of_one(self) -> tuple[tuple[Any, ...], Any, Callable[[Any], tuple[Any, Any]] | None]:
         """The arrays of a single environment.
 
