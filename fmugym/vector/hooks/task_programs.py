@@ -44,7 +44,6 @@ class TaskPrograms:
         seen: The arrays that the second program stores.
         variables: The types of the episode variables by name.
         updated: The names of the variables that ``_update`` writes.
-        is_compiled: Whether they compute what the hooks do; otherwise Python calls these.
     """
 
     inputs: Program
@@ -52,7 +51,6 @@ class TaskPrograms:
     seen: tuple[SeenArray, ...]
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
-    is_compiled: bool = True
 
     @classmethod
     def without_programs(cls, variables: Iterable[str]) -> TaskPrograms:
@@ -66,7 +64,7 @@ class TaskPrograms:
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
         judgement = compile_graph(graph, [], [stopped, *others], 0)
         types = dict.fromkeys(variables, np.dtype(np.float64))
-        return cls(compile_graph(Graph(), [], [], 0), judgement, (), types, (), is_compiled=False)
+        return cls(compile_graph(Graph(), [], [], 0), judgement, (), types, ())
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TaskPrograms:
         """The same task with other tables, by the bytes of those whose place they take."""
