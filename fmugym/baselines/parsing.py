@@ -351,8 +351,7 @@ def _table(entries: Mapping[str, Any], made: Mapping[str, Controller]) -> Contro
     for name, entry in entries.items():
         given = controller_in(entry)
         with naming(name):
-            one = controller_of(given) if isinstance(given, str) and name not in made else given
-            one = made.get(name, one)
+            one = made.get(name) or (controller_of(given) if isinstance(given, str) else given)
             is_signal = isinstance(entry, Mapping)
             found[name] = Signal(one, entry["min"], entry["max"]) if is_signal else one
     return ControllerTable(found)

@@ -593,18 +593,22 @@ def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
 
 
 def _tried(env: FMUEnv, task: Task, texts: Mapping[str, Any]) -> tuple[list[Finding], set[str]]:
-    """What is wrong with controllers of all actions, and which actions they move."""
-    wrong, moved, parts = [], set[str](), _parts(task)
+    """What is wrong with controllers, and which actions they move.
+
+    Those that stand in tables, or act in the warm-up, need not fit all actions.
+    """
+    wrong, moved, parts = list[Finding](), set[str](), _parts(task)
     given_to_env = {} if env.spec is None else env.spec.kwargs
     master = {name: one for name, one in given_to_env.items() if name == "master"}
     with closing(load(task.physical(), **master)) as physical:
-        for name in [one for one in texts if one not in parts]:
+        for name, text in texts.items():
             try:
                 with task.root.child("controllers").child(name).placing():
-                    moved.update(_moved(_bound(physical, texts[name]), env.action_names or ()))
+                    moved.update(_moved(_bound(physical, text), env.action_names or ()))
             except FMUGymError as error:
                 cure = "let it measure what the agent observes, and give a number for each action"
-                wrong.append(Finding("error", "controllers", str(error), cure))
+                found = Finding("error", "controllers", str(error), cure)
+                wrong += [] if name in parts else [found]
     return wrong, moved
 
 

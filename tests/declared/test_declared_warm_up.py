@@ -80,7 +80,7 @@ def test_it_leads_where_the_controller_leads_as_an_agent(controller, load):
 CASCADE = {
     "u": "pid of=T setpoint=wish kp=0.4 ti=20000",
     "wish": {
-        "controller": "pid of=P setpoint='T_set / 7' kp=2 ti=7200 offset=20",
+        "controller": "pid of=P setpoint=T_set kp=0.2 ti=7200 offset=18",
         "min": 15,
         "max": 24,
     },
@@ -122,7 +122,7 @@ def test_a_table_may_leave_out_actions(load):
     warm = {"period": "1d", "controller": {"Q_int": 120}}
     env = load(HOUSE | {"agent": agent, "variables": variables, "warm_up": warm})
     env.reset(seed=0)
-    assert env.inputs == (0.0, 120.0)
+    assert env.inputs[:2] == (0.0, 120.0)
 
 
 def test_a_schedule_acts_by_the_clock(load):

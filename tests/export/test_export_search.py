@@ -32,8 +32,8 @@ PAIR = {
 }
 HEAT = "pid of=T setpoint=21 kp=0.1 ti=7200 td=300"
 CASCADE = (
-    '{ gains = "pid of=T setpoint=wish kp=-80 ti=9000", u = "schedule 02:00=0.3 03:00=0.9", '
-    'wish = { controller = "pid of=T setpoint=19.5 kp=2 ti=7200 offset=20", min = 15, max = 24 } }'
+    '{ gains = "pid of=T setpoint=wish kp=-30 ti=200000", u = "schedule 02:00=0.3 03:00=0.9", '
+    'wish = { controller = "pid of=T setpoint=21 kp=0.5 ti=20000 offset=15", min = 5, max = 24 } }'
 )
 SWITCH = "hysteresis of=T setpoint=21 band=0.3 below=0.8 above=0.2"
 HEATERS = {
@@ -133,10 +133,10 @@ TABLES = {
     "constants": {"u1": 0.25, "u2": -1},
     "a schedule": {"u1": "schedule 00:00=0.1 00:01=0.3", "u2": "pid of=y2 setpoint=y1 kp=-3"},
     "a cascade": {
-        "u2": "pid of=y2 setpoint=b kp=-3 ti=5 td=0.1",
-        "b": {"controller": "pid of=y1 setpoint=a+y2/9 kp=2 ti=1 offset=0.1", "min": -2, "max": 2},
+        "u2": "pid of=y2 setpoint=b kp=-0.6 ti=5 td=0.1",
+        "b": {"controller": "pid of=y1 setpoint=a+y2/9 kp=1 ti=1 offset=0.1", "min": -2, "max": 2},
         "a": {"controller": "pid of=y2 setpoint=0.5 kp=1 ti=3", "min": -1, "max": 1.5},
-        "u1": "pid of=a+b setpoint=y1 kp=1.5 ti=2",
+        "u1": "pid of=a+b setpoint=y1 kp=0.4 ti=2",
     },
 }
 
@@ -177,7 +177,8 @@ class Agents:
         agent = agent_of(env, controller_from(TABLES[name]))
         made, controller = exported(agent, tmp_path, self.language), controller_from(TABLES[name])
         places = [env.observation_names.index(one.name) for one in agent.logic.measurements]
-        rows = np.random.default_rng(0).normal(size=(400, 2)).cumsum(axis=0) / 20
+        waves = np.sin(np.arange(400)[:, None] / [17.0, 31.0])
+        rows = 0.4 * waves + np.random.default_rng(0).normal(size=(400, 2)) / 10
         for _ in range(2):
             made.begin()
             controller.bind(env)
