@@ -275,7 +275,8 @@ def _checked(name: str, entry: Any) -> Law | Signal:
             f"{name}: expected a controller of one number, such as a PID, a Hysteresis, a Schedule "
             f"or a number, got {kind}"
         )
-    return entry
+    checked: Law | Signal = entry
+    return checked
 
 
 def _names_in(text: str) -> list[str]:

@@ -83,13 +83,14 @@ def read_warm_up(
                 found[name] = _signal(one, known, name_of)
                 continue
             variable = _action_of(one, name, actions)
-            found[variable.alias] = controller = (
+            controller: Any = (
                 _thermostat(one, variable, controlled)
                 if one.value in THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
             _rename(controller, name_of)
             check_controller(one, variable, controller)
+            found[variable.alias] = controller
     controllers = None
     if found and len(found) == len(given):
         with entry.child("controller").noting():

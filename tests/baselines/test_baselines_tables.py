@@ -291,7 +291,7 @@ class TestTexts:
         }
         with pytest.raises(fmugym.ConfigError, match="u1: 'all' is a table"):
             named_controllers(known | {"all": table, "both": {"u1": "all"}})
-        with pytest.raises(fmugym.ConfigError, match="u1: .*'colt'.*'cold'"):
+        with pytest.raises(fmugym.ConfigError, match=r"u1: .*'colt'.*'cold'"):
             named_controllers(known | {"all": {"u1": "colt"}})
 
     def test_ranges_of_all_entries(self):
