@@ -162,8 +162,8 @@ class Controller(KnownArguments, ABC):
             ConfigError: If there are no such formulas.
         """
         raise ConfigError(
-            f"a controller of type {type(self).__name__} cannot be exported; a PID, a Hysteresis "
-            "and an LQR can be"
+            f"a controller of type {type(self).__name__} cannot be exported; a PID, a Hysteresis, "
+            "a Schedule, an LQR and a table of such can be"
         )
 
     def _names_of(self, env: Any) -> tuple[str, ...]:

@@ -71,5 +71,5 @@ class Law(Controller):
         self._state = tuple(np.where(mask, start, now) for start, now in pairs)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
-        elements, self._state = self.law(rows.T, self._state)
+        elements, self._state = self.law([*rows.T], self._state)
         return np.stack([np.broadcast_to(one, len(rows)) for one in elements], axis=-1)

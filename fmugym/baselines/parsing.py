@@ -349,10 +349,9 @@ def _table(entries: Mapping[str, Any], made: Mapping[str, Controller]) -> Contro
     """Make a table, some of whose controllers are made already."""
     found: dict[str, Any] = {}
     for name, entry in entries.items():
-        given = controller_in(entry)
+        one: Any = made.get(name, controller_in(entry))
         with naming(name):
-            one = controller_of(given) if isinstance(given, str) and name not in made else given
-            one = made.get(name, one)
+            one = controller_of(one) if isinstance(one, str) else one
             is_signal = isinstance(entry, Mapping)
             found[name] = Signal(one, entry["min"], entry["max"]) if is_signal else one
     return ControllerTable(found)

@@ -19,7 +19,7 @@ from fmugym.checks import Spellings, check_mapping, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.expressions.language import Expression
 
-__all__ = ["ControllerTable", "Signal", "elements_of", "naming"]
+__all__ = ["ControllerTable", "Signal", "naming"]
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,12 @@ class ControllerTable(Law):
     def laws(self) -> list[Law]:
         """The controllers of all entries."""
         return [self._law(name) for name in self.entries]
+
+    @property
+    def moved(self) -> list[str]:
+        """The names of the actions that do not always have the same value, once it is bound."""
+        pairs = zip(self.action_names or (), self._columns, strict=True)
+        return [name for name, own in pairs if not isinstance(self.entries[own], Constant)]
 
     def told(self) -> list[tuple[Any, ...]]:
         """What tells the table from others, before it is bound."""
@@ -156,29 +162,25 @@ class ControllerTable(Law):
         Raises:
             ConfigError: If the entries are not those of the actions. The text says what to do.
         """
-        parts, names = elements_of(self.space), self.action_names
+        parts, names = _elements(self.space), self.action_names
         if names is None or len(names) != len(parts):
             raise ConfigError(
                 "a hook makes something of the actions, so that they have no names; a table of "
                 "controllers needs some: play a task file"
             )
-        known, self._columns = Spellings("action", names), list[str]()
+        known = Spellings("action", names)
         found = {known.find(name): name for name in self.acting}
-        for name in self.acting:
-            if known.find(name) is None:
-                text = unknown_name("action", name, names)
-                raise ConfigError(f"{text}; a signal has 'min' and 'max'")
         for name in self.cascaded:
             if known.find(name) is not None:
                 raise ConfigError(f"{name!r} is an action, whose limits the task has")
+        if None in found:
+            text = unknown_name("action", found[None], names)
+            raise ConfigError(f"{text}; a signal has 'min' and 'max'")
         for name in names:
             if name not in found:
-                text = (
-                    f"the table has no controller of {name!r}; write for example {name} = 0 in it"
-                )
-                raise ConfigError(text)
-            self._columns.append(found[name])
-        return {found[name]: part for name, part in zip(names, parts, strict=True)}
+                raise ConfigError(f"the table has no controller of {name!r}; write {name} = 0, say")
+        self._columns = [found[name] for name in names]
+        return dict(zip(self._columns, parts, strict=True))
 
     def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
         """See ``Law.law``."""
@@ -235,7 +237,7 @@ class ControllerTable(Law):
         return beyond + reduce(np.minimum, readers)
 
 
-def elements_of(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
+def _elements(space: spaces.Space[Any]) -> list[spaces.Space[Any]]:
     """The space of each number of an action.
 
     Raises:
@@ -273,7 +275,8 @@ def _checked(name: str, entry: Any) -> Law | Signal:
             f"{name}: expected a controller of one number, such as a PID, a Hysteresis, a Schedule "
             f"or a number, got {kind}"
         )
-    return entry
+    checked: Law | Signal = entry
+    return checked
 
 
 def _names_in(text: str) -> list[str]:

@@ -15,9 +15,11 @@ from fmugym.checks import Spellings, check_mapping
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
+    "acting_text",
     "controller_in",
     "is_table",
     "named_controllers",
+    "parts_of",
     "resolved",
     "table_in",
     "text_of",
@@ -105,6 +107,16 @@ def named_controllers(given: Mapping[str, Any]) -> dict[str, Any]:
     return {name: resolved(one, given) for name, one in given.items()}
 
 
+def parts_of(given: Mapping[str, Any]) -> set[Any]:
+    """What stands in tables, among others the names of other controllers.
+
+    Args:
+        given: As for ``named_controllers``.
+    """
+    tables = [table_in(one) for one in given.values() if is_table(one)]
+    return {controller_in(entry) for table in tables for entry in table.values()}
+
+
 def resolved(given: Any, known: Mapping[str, Any]) -> Any:
     """A controller without names: a text or a number; a table is a text.
 
@@ -126,9 +138,16 @@ def resolved(given: Any, known: Mapping[str, Any]) -> Any:
     )
 
 
+def acting_text(given: Any) -> str:
+    """The text of a controller; a number is a schedule that has one action."""
+    return given if isinstance(given, str) else f"schedule 00:00={given}"
+
+
 def _named(name: str, given: Any, known: Mapping[str, Any]) -> Any:
     """What an entry of a table stands for."""
     own = Spellings("controller of the task", known).find(given)
+    if own is None and known and isinstance(given, str) and given.isidentifier():
+        raise ConfigError(f"{name}: {unknown_name('controller of the task', given, known)}")
     if own is not None and is_table(known[own]):
         raise ConfigError(f"{name}: {own!r} is a table; an entry is a controller of one number")
     return given if own is None else known[own]

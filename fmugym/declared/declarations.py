@@ -209,6 +209,12 @@ class Declarations:
         """Whether actions go from -1 to 1."""
         return bool(self.agent("rescale").value) and not self.is_physical
 
+    def range_of(self, variable: TaskVariable) -> Limits:
+        """The lowest and the highest number of an action, in the form of the actions."""
+        if self.is_physical:
+            return variable.range
+        return (-1.0, 1.0) if self.rescales else variable.chosen
+
     @property
     def normalization(self) -> str | None:
         """What observations are normalized by: ``"limits"``, ``"nominal"``; None for nothing."""
@@ -324,12 +330,12 @@ class Declarations:
                 self.variables.check_input(entry, variable)
                 _check_action(variable)
                 check_levels(variable)
-        entry = self.root.child("agent").child("actions")
-        mistakes = self.root.mistakes
-        hidden = any(mistakes.explain(("variables", one.alias, "levels")) for one in actions)
-        if not hidden and len({bool(variable.levels) for variable in actions}) > 1:
-            entry.note(entry.error("either all actions have levels, or none has"))
         return actions
+
+    @property
+    def are_choices(self) -> bool:
+        """Whether an agent chooses a level of each action; otherwise actions are numbers."""
+        return all(variable.levels for variable in self.actions)
 
     @property
     def knows_actions(self) -> bool:

@@ -370,9 +370,11 @@ VARIABLE: Final = Table(
         ),
         "levels": Key(
             Kind(_levels, _NUMBERS),
-            "The values that an action chooses from; of an Enumeration, values of its items. The "
-            "agent's action space is then `Discrete` or `MultiDiscrete`; "
-            "[controllers](task-file.md#what-controllers-see-and-write) write values.",
+            "The values that an action chooses from; of an Enumeration, values of its items. If "
+            "all actions have some, the agent's action space is `Discrete` or `MultiDiscrete`. "
+            "Beside an action without, such a one is a number, whose range has equal parts, one "
+            "for each level in ascending order. "
+            "[Controllers](task-file.md#what-controllers-see-and-write) write values.",
         ),
         "delta": Key(
             POSITIVE,
@@ -658,8 +660,8 @@ WARM_UP: Final = Table(
             "A text as [on the command line](baselines.md#on-the-command-line), a name from "
             '`controllers`, or a number. `"thermostat"` alone gives the highest action below the '
             "set point and the lowest above it, if the task has one set point `of` something, or "
-            "one set point and one observed variable. With several actions, a table: "
-            '`{ u = "pid of=T setpoint=21 kp=0.5", v = 0 }`.',
+            "one set point and one observed variable. With several actions, a "
+            "[table](task-file.md#several-actions), in which some may be left out.",
         ),
         "cache": Key(
             FLAG,

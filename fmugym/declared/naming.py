@@ -413,10 +413,10 @@ class Naming:
             attribute: ``"action"`` or ``"previous_action"``.
         """
         declared, place = self.declared, self._place_of(variable)
-        if declared.is_physical or not variable.levels:
+        if declared.is_physical or not declared.are_choices:
             element = self.read(attribute, place, dtype=np.float32).cast(np.float64)
             if variable.levels:
-                return self._nearest_level(variable, element)
+                return self._level(variable, element)
             return self._rescaled(variable, element) if declared.rescales else element
         keys = [] if len(declared.actions) == 1 else [place]
         levels = self._table_of_levels(variable, np.array(variable.levels))
@@ -518,11 +518,17 @@ class Naming:
         value = (high - low) / 2 * element
         return value if variable.delta else (low + high) / 2 + value
 
-    def _nearest_level(self, variable: TaskVariable, element: Value) -> Value:
-        """The level that is nearest to a value, the lower one of two."""
+    def _level(self, variable: TaskVariable, element: Value) -> Value:
+        """The level that a number stands for.
+
+        In the physical form that is the nearest one, the lower one of two. For an agent, the range
+        of the number has equal parts, one for each level.
+        """
         levels = np.sort(variable.levels)
-        middles = ((levels[1:] + levels[:-1]) / 2).tolist()
-        place: Value = reduce(operator.add, [(element > middle) * 1 for middle in middles])
+        ends = (levels[1:] + levels[:-1]) / 2
+        if not self.declared.is_physical:
+            ends = np.linspace(*self.declared.range_of(variable), len(levels) + 1)[1:-1]
+        place: Value = reduce(operator.add, [(element > end) * 1 for end in ends.tolist()])
         return place.taken(self._table_of_levels(variable, levels))
 
     def kept(self, name: str) -> tuple[Value, Value] | None:

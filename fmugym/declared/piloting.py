@@ -115,7 +115,11 @@ class Pilot:
         if variable.levels:
             order = np.argsort(variable.levels)  # the lower of two levels counts as nearer
             distances = np.abs(np.array(variable.levels)[order, None] - value)
-            return order[distances.argmin(axis=0)]
+            nearest = distances.argmin(axis=0)
+            if self._declared.are_choices:
+                return order[nearest]
+            low, high = self._declared.range_of(variable)
+            return low + (high - low) * (nearest + 0.5) / len(order)
         if place in self._present:
             value = np.clip(value - self._present[place](env), -variable.delta, variable.delta)
         low, high = variable.chosen

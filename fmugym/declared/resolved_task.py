@@ -81,7 +81,7 @@ class ResolvedTask:
         observation_names: The names of the elements of the observation.
         action_names: Those of the action.
         action_masks: A function of the environment that tells which levels of the actions are not
-            blocked, shape (levels,); None if the actions have no levels.
+            blocked, shape (levels,); None if an action has no levels.
         warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
         cost_limits: What the costs of an episode may add up to, by name.
         unphysical_keys: The keys for which observations or actions are not in the task's units.
@@ -288,13 +288,10 @@ class ResolvedTask:
         are_inputs = all(
             variable.in_fmu is not None and is_plain(variable) for variable in variables
         )
-        rescales = self._declared.rescales
-        if are_inputs and not self._declared.inputs and not rescales:
+        if are_inputs and not self._declared.inputs and not self._declared.rescales:
             return None
-        if self._declared.is_physical:
-            return _box([variable.range for variable in variables])
-        if not variables[0].levels:
-            return _box([(-1.0, 1.0) if rescales else one.chosen for one in variables])
+        if self._declared.is_physical or not self._declared.are_choices:
+            return _box([self._declared.range_of(variable) for variable in variables])
         counts = [len(variable.levels) for variable in variables]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
 
@@ -330,7 +327,7 @@ class ResolvedTask:
 
     def _action_masks(self) -> Hook | None:
         naming, values = self._naming, list[Value]()
-        for variable in self._declared.actions:
+        for variable in self._declared.actions if self._declared.are_choices else ():
             for level in map(naming.constant, variable.levels):
                 is_switched = variable.is_switched
                 values.append(

@@ -114,10 +114,10 @@ class TaskEnv(FMUEnv):
             the least time on or off keeps its action from being switched to it.
 
         Raises:
-            ConfigError: If the actions have no levels.
+            ConfigError: If an action has no levels.
         """
         if self._masks is None:
-            raise ConfigError("action_masks needs actions with 'levels'")
+            raise ConfigError("action_masks needs 'levels' of each action")
         return self._masks(self)
 
 

@@ -70,7 +70,8 @@ def read_warm_up(
     known = root.child("controllers").items()
     for one in known.values():
         with one.noting():
-            _require_controller(one, known)
+            if not one.mistakes.explain(one.keys):
+                _require_controller(one, known)
     entry = root.child("warm_up")
     if entry.value is None:
         return WarmUpTable(entry)
@@ -82,13 +83,14 @@ def read_warm_up(
                 found[name] = _signal(one, known, name_of)
                 continue
             variable = _action_of(one, name, actions)
-            found[variable.alias] = controller = (
+            controller: Any = (
                 _thermostat(one, variable, controlled)
                 if one.value in THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
             _rename(controller, name_of)
             check_controller(one, variable, controller)
+            found[variable.alias] = controller
     controllers = None
     if found and len(found) == len(given):
         with entry.child("controller").noting():
@@ -115,8 +117,9 @@ def _signal(entry: Entry, known: Mapping[str, Entry], name_of: Callable[[str], s
 
     controller = _acting(entry.required("controller"), known)
     _rename(controller, name_of)
+    low, high = (entry.required(key).value for key in ("min", "max"))
     with entry.placing():
-        return Signal(controller, entry.value["min"], entry.value["max"])
+        return Signal(controller, low, high)
 
 
 def _rename(controller: Law, name_of: Callable[[str], str]) -> None:
@@ -127,22 +130,19 @@ def _rename(controller: Law, name_of: Callable[[str], str]) -> None:
 
 def _require_controller(entry: Entry, known: Mapping[str, Entry]) -> None:
     """Check a controller that the task names, also one with ranges."""
+    from fmugym.baselines import controller_of
     from fmugym.baselines.parsing import has_range, search_of
     from fmugym.baselines.table_texts import is_table, resolved
 
-    if not is_table(entry.value):
-        if has_range(entry.value):
-            search_of(entry.value)
-        else:
-            _controller(entry, {})
-        return
-    text = resolved(entry.value, {name: one.value for name, one in known.items()})
-    if has_range(text):
-        search_of(text)
+    given = entry.value
+    if is_table(given):
+        given = resolved(given, {name: one.value for name, one in known.items()})
+    if has_range(given):
+        search_of(given)
+    elif is_table(given):
+        _require_expressions(controller_of(given))
     else:
-        from fmugym.baselines import controller_of
-
-        _require_expressions(controller_of(text))
+        _controller(entry, {})
 
 
 def _thermostat(

@@ -24,6 +24,7 @@ __all__ = [
     "Policy",
     "Summary",
     "action_of",
+    "given_controller",
     "policy_of",
     "policy_of_controller",
     "simulate",
@@ -146,14 +147,27 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
     Raises:
         ConfigError: If it names no controller, or the controller does not fit the environment.
     """
+    given = given_controller(env, text)
+    if not isinstance(given, str):
+        return action_of(env, str(given))
+    return policy_of_controller(controller_of(given), env)
+
+
+def given_controller(env: FMUEnv, text: str) -> Any:
+    """The controller that a text gives without names: a text, or a number of the task file.
+
+    Args:
+        env: The environment.
+        text: As for ``policy_of``.
+
+    Raises:
+        ConfigError: If it is a name that the task file does not have.
+    """
     known = _named_controllers(env)
     own = Spellings("controller of the task", known).find(text)
     if own is None and known and text.isidentifier():
         raise unknown_name("controller of the task", text, known)
-    given = resolved(text if own is None else known[own], known)
-    if not isinstance(given, str):
-        return action_of(env, str(given))
-    return policy_of_controller(controller_of(given), env)
+    return resolved(text if own is None else known[own], known)
 
 
 def policy_of_controller(controller: Any, env: FMUEnv) -> Policy:

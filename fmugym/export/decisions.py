@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.baselines.controller import Controller
-from fmugym.baselines.feedback import Law
+from fmugym.baselines.law import Law
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.network import Activation, Layer, Network, Scaling
@@ -76,8 +76,8 @@ def _of_policy(policy: Policy) -> Decision:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
     controller, past = policy.baseline, policy.starts
     starts = dict(zip(_MEMORY, past, strict=False))  # without a history there are none
-    if isinstance(controller, Law):
-        starts[_CONTROLLER] = np.array(controller.starts, np.float64).reshape(-1)
+    if isinstance(controller, Law) and controller.starts:
+        starts[_CONTROLLER] = np.concatenate([np.ravel(one) for one in controller.starts])
     network = _network_of(policy)
 
     def decide(seen: Sequence[Value], memory: Sequence[Sequence[Value]], ask: _Ask) -> _Decided:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena, most_steps_of
 from fmugym.baselines.parsing import plans_ahead, simple_controllers
-from fmugym.baselines.table_texts import named_controllers
+from fmugym.baselines.table_texts import acting_text, named_controllers, parts_of
 from fmugym.declared.likely_units import require_units
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -125,15 +125,17 @@ class Probe:
 
 def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) -> Iterator[Agent]:
     """The controllers that a task declares, that do not plan ahead and that fit its actions."""
-    for name, one in named_controllers(task.get("controllers", {})).items():
+    given = task.get("controllers", {})
+    for name, one in named_controllers(given).items():
         if plans_ahead(one):
             continue
-        agent = Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")
+        agent = Agent(name, acting_text(one))
         try:
             (controller,) = simple_controllers({name: agent.text})
             controller.bind(env)
         except ConfigError as error:
-            tell(f"left out: {name}: {error}")
+            if name not in parts_of(given):
+                tell(f"left out: {name}: {error}")
         else:
             yield agent
 

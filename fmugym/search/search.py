@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.arena import MOST_STEPS, Arena
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import has_range, search_of
@@ -17,7 +17,7 @@ from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
 from fmugym.search.probe import FEW, MOST_PROBED, Probe
 
-__all__ = ["VALIDATION", "Search"]
+__all__ = ["VALIDATION", "Search", "tuning_steps"]
 
 VALIDATION: Final = 500_000
 """Episodes of validation have seeds from here on, those of training have smaller ones."""
@@ -72,6 +72,18 @@ _OF_NETWORKS: Final = 4.0
 _OF_CORRECTIONS: Final = 0.4
 """The first steps of the weights are 1, so many times as large in networks, and where they correct
 a controller."""
+
+
+def tuning_steps(most_steps: int | None, is_same: bool) -> int:
+    """The steps until the numbers of a controller are found, at most.
+
+    Args:
+        most_steps: Those of an episode; None for no limit.
+        is_same: Whether all episodes are the same.
+    """
+    episodes, validated = (1, 1) if is_same else (_EPISODES, _VALIDATED)
+    played = (_MANY + (_TUNING - 1) * FEW) * episodes
+    return MOST_PROBED + (played + _TUNING // _EVERY * 2 * validated) * (most_steps or MOST_STEPS)
 
 
 class Search:

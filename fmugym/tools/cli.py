@@ -20,8 +20,8 @@
     fmugym fit TASK --log plant.csv ... --parameter NAME[=LOW..HIGH] ... [--start NAME[=OUTPUT] ...]
         [--column COLUMN=VARIABLE ...] [--wash-in TIME] [--candidates N] [--output fitted.toml]
         [--plot fit.png]
-    fmugym export AGENT --task TASK --output agent.c|agent.fmu|agent.onnx [--algorithm PPO]
-        [--all-inputs] [--external NAME ...] [--fmi 2.0|3.0] [--platform NAME ...]
+    fmugym export AGENT|--controller TEXT --task TASK --output agent.c|agent.fmu|agent.onnx
+        [--algorithm PPO] [--all-inputs] [--external NAME ...] [--fmi 2.0|3.0] [--platform NAME ...]
     fmugym simulate TASK --plant [ADDRESS] [WHO] [--ahead TIME] [--speed X] [--output FILE ...]
     fmugym serve TASK [WHO] [--port N] [--speed X] [--steps N] [--seed N]
     fmugym bench TASK|model.fmu [--envs N ...] [--seconds S]

@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.archive.variable import Variable
+from fmugym.baselines import controller_of
+from fmugym.baselines.table_texts import acting_text
+from fmugym.episodes.simulation import given_controller
 from fmugym.errors import ConfigError, shown
 from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
@@ -25,10 +28,19 @@ _ENDINGS: Final = (".c", ".fmu", ".onnx")
 
 def add_export(commands: Commands) -> None:
     """Add ``export``."""
-    text = "write a trained agent as C, an FMU or ONNX, with everything around its network"
+    text = "write an agent or a controller as C, an FMU or ONNX, with everything around it"
     command = add_command(commands, "export", _export, text)
     command.add_argument(
-        "agent", type=Path, metavar="AGENT", help="a folder of train, or a zip file of a model"
+        "agent",
+        type=Path,
+        nargs="?",
+        metavar="AGENT",
+        help="a folder of train, or a zip file of a model",
+    )
+    command.add_argument(
+        "--controller",
+        metavar="TEXT",
+        help="instead of an agent, a controller as for simulate, or its name in the task file",
     )
     command.add_argument("--task", required=True, metavar="TASK", help=HELP_OF_TASK)
     command.add_argument(
@@ -72,10 +84,18 @@ def _export(arguments: argparse.Namespace) -> None:
             f"expected a file that ends in {', '.join(_ENDINGS)}, got {shown(str(output))}"
         )
     new_file(output)
-    model, normalization = read_agent(arguments.agent, arguments.algorithm)
-    is_physical = isinstance(model, FoundAgent)
+    if (arguments.agent is None) == (arguments.controller is None):
+        raise ConfigError("give either AGENT or --controller")
+    model, normalization = None, None
+    if arguments.agent is not None:
+        model, normalization = read_agent(arguments.agent, arguments.algorithm)
+    is_physical = model is None or isinstance(model, FoundAgent)
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:
         options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
+        if model is None:
+            text = acting_text(given_controller(env, arguments.controller))
+            controller_of(text)  # raises for ranges
+            model = FoundAgent("controller", text)
         agent = agent_of(env, model, normalization, name=output.stem, **options)
     _show(agent, _written(agent, output, arguments), arguments)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -10,6 +11,7 @@ from typing import Final
 from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
 from fmugym.baselines.table_texts import is_table, table_in
+from fmugym.episodes.simulation import given_controller
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.options import (
     Commands,
@@ -32,7 +34,8 @@ __all__ = ["add_tune"]
 
 _HELP_OF_CONTROLLER: Final = (
     "a controller with ranges in the place of the numbers that are to be found: "
-    "'pid of=T setpoint=20..22 kp=0.05..5 ti=1800..400000'"
+    "'pid of=T setpoint=20..22 kp=0.05..5 ti=1800..400000', a table of several, or the name of one "
+    "in the task file"
 )
 
 
@@ -57,7 +60,7 @@ def add_tune(commands: Commands) -> None:
 
 def _tune(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "rounds", "candidates", "episodes", "steps")
-    search = search_of(arguments.controller)
+    search = _search_in(arguments)
     output: Path | None = arguments.output
     if output is not None:
         _require_name(arguments.name)
@@ -65,6 +68,15 @@ def _tune(arguments: argparse.Namespace) -> None:
     found: list[Tuning] = []
     with shown_in_any_case(lambda: _show(search, found, arguments)):
         _search(search, arguments, found)
+
+
+def _search_in(arguments: argparse.Namespace) -> Search:
+    """The controller with its ranges; its name in the task file will do, and names in a table."""
+    text: str = arguments.controller
+    if text.isidentifier() or is_table(text):
+        with closing(player_maker(arguments.task, master=arguments.master)(physical=True)) as env:
+            text = str(given_controller(env, text))
+    return search_of(text)
 
 
 def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
@@ -100,8 +112,8 @@ def _show(search: Search, found: list[Tuning], arguments: argparse.Namespace) ->
     best, output = found[-1], arguments.output
     text = search.text(best.parameters)
     if output is not None:
-        found_one = table_in(text) if is_table(text) else text
-        write_extension(output, arguments.task, {"controllers": {arguments.name: found_one}})
+        made = table_in(text) if is_table(text) else text
+        write_extension(output, arguments.task, {"controllers": {arguments.name: made}})
     for name in search.at_an_end(best.parameters):
         note(f"the best {name} is at an end of its range; a wider one may have a better one")
     facts = {"controller": text, "parameters": search.numbers(best.parameters)}

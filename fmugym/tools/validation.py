@@ -19,7 +19,9 @@ from gymnasium import spaces
 
 from fmugym.baselines.arena import most_steps_of
 from fmugym.baselines.controller import Controller, FloatArray
-from fmugym.baselines.parsing import controller_of, plans_ahead, simple_controllers
+from fmugym.baselines.parsing import controller_of, has_range, plans_ahead, simple_controllers
+from fmugym.baselines.table import ControllerTable
+from fmugym.baselines.table_texts import is_table, named_controllers, parts_of
 from fmugym.checks import normal_form
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.likely_units import Misreading, finite_values, misreadings
@@ -29,6 +31,7 @@ from fmugym.episodes.simulation import action_of
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
 from fmugym.fmi.words import asked_for
+from fmugym.search.search import tuning_steps
 from fmugym.series.choice import quantities_of
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
@@ -564,41 +567,80 @@ def _of_length(env: FMUEnv) -> Finding:
 
 
 def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
-    """Bind each controller of the task file, but for those that only act in its warm-up."""
+    """Tell whether each controller of the task file can act, and which actions none moves."""
     task = getattr(env, "task", None)
-    given = task.root.child("controllers").items() if isinstance(task, Task) else {}
-    if not isinstance(task, Task) or not given:
+    if not isinstance(task, Task):
         return
-    is_wrong, given_to_env = False, {} if env.spec is None else env.spec.kwargs
+    given = task.root.child("controllers").value or {}
+    texts, names = named_controllers(given), env.action_names or ()
+    wrong, moved = _tried(env, task, texts) if texts else ([], set[str]())
+    yield from wrong
+    steps = f"{tuning_steps(most_steps_of(env), not env.inside.draws.drawn_names):,} steps at most"
+    if texts and not wrong:
+        tuned = ", ".join(name for name, one in texts.items() if has_range(one))
+        more = f"; 'fmugym train' tunes {tuned} with {steps} each" if tuned else ""
+        yield Finding("ok", "controllers", f"each can act: {', '.join(texts)}{more}")
+    rest = [name for name in names if name not in moved]
+    if len(names) > 1 and rest:
+        table = ", ".join(f"{name} = ..." for name in names)
+        yield Finding(
+            "warning" if texts else "ok",
+            "controllers",
+            f"none of the file moves {', '.join(rest)}; ranges of one for all actions are tuned "
+            f"with {steps}",
+            f"give a table, {{ {table} }}",
+        )
+
+
+def _tried(env: FMUEnv, task: Task, texts: Mapping[str, Any]) -> tuple[list[Finding], set[str]]:
+    """What is wrong with controllers, and which actions they move.
+
+    Those that stand in tables, or act in the warm-up, need not fit all actions.
+    """
+    wrong, moved, parts = list[Finding](), set[str](), _parts(task)
+    given_to_env = {} if env.spec is None else env.spec.kwargs
     master = {name: one for name, one in given_to_env.items() if name == "master"}
     with closing(load(task.physical(), **master)) as physical:
-        for name in given.keys() - _acting_in_warm_up(task):
+        for name, text in texts.items():
             try:
-                with given[name].placing():
-                    _bind(physical, given[name].value)
+                with task.root.child("controllers").child(name).placing():
+                    moved.update(_moved(_bound(physical, text), env.action_names or ()))
             except FMUGymError as error:
-                is_wrong = True
                 cure = "let it measure what the agent observes, and give a number for each action"
-                yield Finding("error", "controllers", str(error), cure)
-    if not is_wrong:
-        yield Finding("ok", "controllers", f"each can act: {', '.join(given)}")
+                found = Finding("error", "controllers", str(error), cure)
+                wrong += [] if name in parts else [found]
+    return wrong, moved
 
 
-def _acting_in_warm_up(task: Task) -> set[str]:
-    """The names of controllers that act in the warm-up, each on an action of its own."""
-    given = task.root.child("warm_up").child("controller").value
-    return {str(one) for one in (given.values() if isinstance(given, Mapping) else (given,))}
+def _parts(task: Task) -> set[Any]:
+    """The names of controllers that stand in tables or act in the warm-up."""
+    known = task.root.child("controllers").value or {}
+    warm = task.root.child("warm_up").child("controller").value
+    return parts_of({**known, "": warm}) | {None if is_table(warm) else warm}
 
 
-def _bind(env: FMUEnv, given: Any) -> None:
-    """Let a controller find what it needs; the copies that an MPC plans with take too long."""
+def _bound(env: FMUEnv, given: Any) -> Controller | None:
+    """A controller that has found what it needs; None for a constant action.
+
+    The copies that an MPC plans with take too long.
+    """
     if not isinstance(given, str):
         action_of(env, str(given))
-    elif not plans_ahead(given):
-        (controller,) = simple_controllers({"": given})
-        controller.bind(env)
-    elif isinstance(warm := getattr(controller_of(given), "warm", None), Controller):
-        warm.bind(env)
+        return None
+    if plans_ahead(given):
+        controller = controller_of(given)
+        if isinstance(warm := getattr(controller, "warm", None), Controller):
+            warm.bind(env)
+        return controller
+    (controller,) = simple_controllers({"": given})
+    return controller.bind(env)
+
+
+def _moved(controller: Controller | None, names: Sequence[str]) -> Sequence[str]:
+    """Which of the actions a bound controller moves."""
+    if isinstance(controller, ControllerTable):
+        return controller.moved
+    return () if controller is None else names
 
 
 def _of_hooks(env: FMUEnv) -> Iterator[Finding]:

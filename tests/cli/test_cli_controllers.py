@@ -93,10 +93,41 @@ def test_of_two_actions(tmp_path):
     one, actions = '"pid of=q_ddot setpoint=0 kp=1"', '["tau_1", "tau_2"]'
     warm = 'warm_up = { period = "0.2s", controller = { tau_1 = "one" } }\n'
     file.write_text(warm + text.format(one=one.replace("q_ddot", "theta"), actions=actions) + more)
-    (finding,) = findings_of(file)
-    assert finding.verdict == "error"
+    wrong, rest = findings_of(file)
+    assert (wrong.verdict, rest.verdict) == ("error", "warning")
     for fact in ("controllers.two", "one number", "Box"):
-        assert fact in finding.text
+        assert fact in wrong.text
+    assert "tau_1, tau_2" in rest.text
+
+
+TABLES = {
+    "both": ('{ tau_1 = "two", tau_2 = "pid of=q setpoint=0 kp=0.1..1" }', ""),
+    "one": ('{ tau_1 = "two", tau_2 = 0.5 }', "tau_2"),
+    "a cascade": (
+        '{ tau_1 = "pid of=q_dot setpoint=rate kp=1", tau_2 = "two", rate = { controller = '
+        '"pid of=q setpoint=0 kp=1..2", min = -1, max = 1 } }',
+        "",
+    ),
+    "none": ("{ tau_1 = 0.5, tau_2 = 0 }", "tau_1, tau_2"),
+}
+
+
+@pytest.mark.parametrize(("one", "rest"), TABLES.values(), ids=TABLES)
+def test_the_actions_that_none_moves(one, rest, tmp_path):
+    """A controller that is part of a table need not give all actions."""
+    more = '\n[inputs]\ntau = "tau_1 + tau_2"\n'
+    text = TEXT.replace(
+        "tau = {{ min = -1, max = 1 }}",
+        "tau_1 = {{ min = -1, max = 1 }}\ntau_2 = {{ min = -1, max = 1 }}",
+    )
+    file = tmp_path / "task.toml"
+    file.write_text(text.format(one=one, actions='["tau_1", "tau_2"]') + more)
+    first, *others = findings_of(file)
+    assert first.verdict == "ok"
+    assert ("tunes one with" in first.text) == (".." in one)
+    assert [other.text.partition(";")[0].endswith(f"moves {rest}") for other in others] == [True][
+        : bool(rest)
+    ]
 
 
 def test_an_expression_measures_what_its_names_do(tmp_path):

@@ -11,6 +11,7 @@ import pytest
 import fmugym
 from fmugym.baselines import MPC
 from fmugym.baselines.arena import Arena
+from fmugym.baselines.table_texts import table_in
 from fmugym.search.policy import Agent
 from fmugym.tools import watching
 from fmugym.training import searching
@@ -67,6 +68,29 @@ class TestTrain:
         assert "planner" in out
         facts = json.loads((tmp_path / "agent" / "agent.json").read_text())
         assert set(facts["test"]) == {facts["agent"], "constant action", "planner"}
+
+    def test_a_table_is_tuned_and_is_the_agent_if_nothing_beats_it(self, written, tmp_path, cli):
+        """Its numbers are found before policies enter."""
+        loop = "pid of=theta setpoint=0 kp=-2..-0.01 td=0..0.5"
+        brake = "pid of=theta setpoint=0 kp=0.01..1"
+        document = TWO | {"controllers": {"brake": brake, "pair": {"a": loop, "b": "brake"}}}
+        folder = tmp_path / "agent"
+        options = "--output", folder, "--rounds", "20", "--episodes", "2"
+        code, out, err = cli("train", written(document), *options)
+        assert code == 0, err
+        assert "to be beaten: pair (to be tuned)" in out + err
+        assert "left out" not in err  # the brake is a part of the table
+        facts = json.loads((folder / "agent.json").read_text())
+        entries = table_in(facts["controller"])
+        assert facts["agent"] == "tuned pair"
+        assert list(entries) == ["a", "b"]
+        assert ".." not in facts["controller"]
+        played = ("simulate", written(document), "--seed", 500, "--json")
+        told = [
+            json.loads(cli(*played, *who)[1])["episodes"][0]["total_reward"]
+            for who in (("--agent", folder), ("--controller", facts["controller"]))
+        ]
+        assert told[0] == told[1]
 
     def test_one_that_fails_in_the_test_is_left_out(self, written, tmp_path, cli, late):
         code, out, err = cli("train", written(ONE), "--output", tmp_path / "agent", *SHORT)

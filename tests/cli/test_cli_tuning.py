@@ -12,6 +12,7 @@ import pytest
 import fmugym
 from fmugym.baselines import PID
 from fmugym.baselines.parsing import search_of
+from fmugym.baselines.table_texts import table_in
 
 HOUSE = "fmugym/House-v0"
 RANGES = "pid of=T setpoint=20..22 kp=0.05..5 ti=14400"
@@ -102,6 +103,47 @@ class TestTune:
         assert "Traceback" not in err
         assert tomllib.loads(path.read_text()) == {"controllers": {"tuned": out.strip()}}
         assert out.startswith("pid of=T")
+
+    def test_a_table_is_tuned_together(self, tmp_path, cli):
+        """By its name; what comes out is a table in a task file, and a text that acts."""
+        base, output = tmp_path / "two.toml", tmp_path / "tuned.toml"
+        base.write_text(TWO)
+        code, out, _ = cli("tune", base, "both", *FEW, "--output", output, "--json")
+        found = json.loads(out)
+        assert code == 0
+        assert list(found["parameters"]) == ["tau1.kp", "tau1.td", "tau2.kp"]
+        written = tomllib.loads(output.read_text())["controllers"]["tuned"]
+        assert written == table_in(found["controller"])
+        assert written["rate"] == {"controller": "pid of=q2 setpoint=0 kp=1", "min": -1, "max": 1}
+        options = "--episodes", "2", "--steps", "100"
+        rows = [
+            rewards(cli, output, "--controller", who, *options)
+            for who in ("tuned", found["controller"])
+        ]
+        assert rows[0] == rows[1]
+        assert sum(rows[0]) / 2 == pytest.approx(found["mean_reward"], rel=1e-12)
+
+
+TWO = """
+fmu = { bundled = "DoublePendulum" }
+time_step = "20ms"
+episode_length = "1s"
+reward = "-q1**2 - q2**2"
+[variables]
+tau1 = { min = -1, max = 1 }
+tau2 = { min = -1, max = 1 }
+[parameters]
+q1_0 = { distribution = "uniform", low = -0.3, high = 0.3 }
+[agent]
+actions = ["tau1", "tau2"]
+observations = ["q1", "q2", "q1_dot", "q2_dot"]
+[controllers]
+steady = "pid of=q2_dot setpoint=rate kp=0.01..1"
+[controllers.both]
+tau1 = "pid of=q1 setpoint=0 kp=0.01..1 td=0..1"
+tau2 = "steady"
+rate = { controller = "pid of=q2 setpoint=0 kp=1", min = -1, max = 1 }
+"""
 
 
 class TestSearch:

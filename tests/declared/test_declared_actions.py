@@ -5,10 +5,12 @@ from functools import partial
 import numpy as np
 import pytest
 from combinations import in_turn
+from gymnasium import spaces
 from vector_tools import require_same_alone
 from ways import in_way
 
 import fmugym
+from fmugym.baselines import controller_of
 from fmugym.errors import ConfigError, TaskError
 
 DT = 0.1
@@ -124,13 +126,12 @@ def test_mistakes_are_placed(variable, fact):
 
 
 def test_mistakes_in_levels_are_told_alone():
-    """Whether all actions have levels cannot be known then."""
     variables = {"u": {"name": "tau", "levels": [0, 1]}, "v": {"levels": [1]}}
     agent = PLAIN["agent"] | {"actions": ["u", "v"]}
     with pytest.raises(TaskError) as caught:
         fmugym.load(PLAIN | {"variables": variables, "agent": agent})
+    assert str(caught.value).count("\n") == 0
     assert "two or more" in str(caught.value)
-    assert "none has" not in str(caught.value)
 
 
 def test_observations_have_no_delta():
@@ -143,6 +144,46 @@ def test_masks_need_levels(load):
     env = load(task("rate"))
     with pytest.raises(ConfigError, match="levels"):
         env.action_masks()
+
+
+MIXED = {
+    "fmu": {"bundled": "DoublePendulum"},
+    "time_step": "20ms",
+    "episode_length": "1s",
+    "variables": {"tau1": {"levels": [0.4, -0.2, 0]}, "tau2": {"min": -1, "max": 1}},
+    "agent": {"actions": ["tau1", "tau2"], "observations": ["q1", "q2"]},
+    "reward": "-q1**2 - q2**2 - 0.1 * previous(tau1)",
+}
+"""The switch has levels, the other action none."""
+
+
+class TestLevelsBesideANumber:
+    """The range of the number has a part for each level: a third of it, here."""
+
+    @pytest.mark.parametrize(("rescale", "low", "high"), [(False, -0.2, 0.4), (True, -1.0, 1.0)])
+    def test_parts_are_equal(self, rescale, low, high, load):
+        env = load(MIXED | {"agent": MIXED["agent"] | {"rescale": rescale}})
+        box = spaces.Box(np.float32([low, -1.0]), np.float32([high, 1.0]))
+        assert env.action_space == box
+        env.reset(seed=0)
+        parts = {0.0: -0.2, 0.32: -0.2, 0.34: 0.0, 0.65: 0.0, 0.68: 0.4, 1.0: 0.4}
+        for part, level in parts.items():
+            env.step(np.array([low + part * (high - low), 0.25]))
+            assert env.inputs == (level, 0.25)
+        with pytest.raises(ConfigError, match="levels"):
+            env.action_masks()
+
+    def test_controllers_write_the_nearest_level(self, load):
+        env = load(MIXED, physical=True)
+        controller = controller_of({"tau1": "pid of=q1 setpoint=0 kp=1", "tau2": 0.5}).bind(env)
+        env.reset(seed=0)
+        for error, level in {0.09: 0.0, 0.21: 0.4, -0.09: 0.0, -0.11: -0.2, 0.5: 0.4}.items():
+            env.step(controller.act(np.array([-error, 0.0])))
+            assert env.inputs == (level, 0.5)
+
+    @pytest.mark.parametrize("way", ["expressions", "one by one"])
+    def test_many_environments_equal_single_ones(self, way):
+        assert require_same_alone(partial(fmugym.load, MIXED), 30, "next_step", way=way)
 
 
 FAILING = PLAIN | {

@@ -77,6 +77,54 @@ def test_it_leads_where_the_controller_leads_as_an_agent(controller, load):
         assert env.step_count == 0
 
 
+CASCADE = {
+    "u": "pid of=T setpoint=wish kp=0.4 ti=20000",
+    "wish": {
+        "controller": "pid of=P setpoint=T_set kp=0.2 ti=7200 offset=18",
+        "min": 15,
+        "max": 24,
+    },
+    "Q_int": "schedule 06:00=300 22:00=50",
+}
+BOTH = {"u": {"levels": [0, 0.5, 1]}, "Q_int": {"min": 0, "max": 400}}
+
+
+@pytest.mark.parametrize("variables", [{"Q_int": BOTH["Q_int"]}, BOTH], ids=["numbers", "a switch"])
+@pytest.mark.parametrize("rescale", [False, True])
+def test_a_cascade_leads_where_it_leads_as_an_agent(variables, rescale, load):
+    """By its name, with one of the actions that is a switch."""
+    agent = HOUSE["agent"] | {"actions": ["u", "Q_int"]}
+    task = HOUSE | {"agent": agent, "variables": HOUSE["variables"] | variables}
+    table = {"controllers": {"cascade": CASCADE}}
+    warm = {"warm_up": {"period": "1d", "controller": "cascade"}}
+    env = load(task | table | warm | {"agent": agent | {"rescale": rescale}})
+    day_before = {"clock": "01-14", "episode_length": "100d"}
+    driven = load(task | day_before, physical=True)
+    controller = controller_of(CASCADE)
+    for seed in (3, 4):
+        env.reset(seed=seed)
+        controller.bind(driven)
+        observation, _ = driven.reset(seed=seed)
+        chosen = []
+        for _ in range(STEPS):
+            chosen.append(controller.act(observation))
+            observation, *_ = driven.step(chosen[-1])
+        wanted = [*driven.inside.readings.values, *driven.inputs]
+        found = [*env.inside.readings.values, *env.inputs]
+        assert found == (pytest.approx(wanted, rel=1e-5) if rescale else wanted)
+        assert {one[1] for one in chosen} == {50.0, 300.0}
+        assert len({one[0] for one in chosen}) > 5
+
+
+def test_a_table_may_leave_out_actions(load):
+    agent = HOUSE["agent"] | {"actions": ["u", "Q_int"]}
+    variables = HOUSE["variables"] | {"Q_int": BOTH["Q_int"]}
+    warm = {"period": "1d", "controller": {"Q_int": 120}}
+    env = load(HOUSE | {"agent": agent, "variables": variables, "warm_up": warm})
+    env.reset(seed=0)
+    assert env.inputs[:2] == (0.0, 120.0)
+
+
 def test_a_schedule_acts_by_the_clock(load):
     env = load(house("schedule 06:00=1 22:00=0.25", clock="01-15 05:30"))
     env.reset(seed=0)
@@ -278,6 +326,10 @@ class TestCache:
             fmugym.load(task)
 
 
+LOOP = {"controller": "pid of=T setpoint=21 kp=1", "min": 0}
+READS_W = "pid of=T setpoint=w kp=1"
+
+
 @pytest.mark.parametrize(
     ("warm_up", "fact"),
     [
@@ -289,6 +341,9 @@ class TestCache:
         ({"period": "1d", "controller": "pid of=TT setpoint=1 kp=1"}, "'T'"),
         ({"period": "1d", "controller": "hysteresis of=T setpoint=T_sot band=1"}, "'T_set'"),
         ({"period": "1d", "controller": {"v": 0}}, "'u'"),
+        ({"period": "1d", "controller": {"u": 0, "w": LOOP | {"max": 1}}}, "'w'"),
+        ({"period": "1d", "controller": {"u": READS_W, "w": LOOP}}, "'max'"),
+        ({"period": "1d", "controller": {"u": READS_W, "w": LOOP | {"max": -1}}}, "below"),
         ({"period": "1d", "controller": 3}, r"3\.0"),
         ({"period": "1d", "controller": 0, "cache": 1}, "cache"),
     ],

@@ -10,13 +10,15 @@ import pytest
 from combinations import in_turn
 from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
+from system_tools import linear_fmu
 from test_export import HEATING, PRESENT, TASKS, Shifted
 from test_export_fmu import controller_of, sampling
 
 import fmugym
 from fmugym import ConfigError, bundled_fmu
-from fmugym.baselines import LQR, PID, Hysteresis
+from fmugym.baselines import LQR, PID, Hysteresis, Random
 from fmugym.baselines import controller_of as controller_from
+from fmugym.baselines.table_texts import table_in
 from fmugym.export import agent_of, write_c, write_fmu
 from fmugym.linearization import linearize
 from fmugym.search.policy import Agent, Policy
@@ -29,6 +31,10 @@ PAIR = {
     "agent": PRESENT | {"actions": ["u", "gains"]},
 }
 HEAT = "pid of=T setpoint=21 kp=0.1 ti=7200 td=300"
+CASCADE = (
+    '{ gains = "pid of=T setpoint=wish kp=-30 ti=200000", u = "schedule 02:00=0.3 03:00=0.9", '
+    'wish = { controller = "pid of=T setpoint=21 kp=0.5 ti=20000 offset=15", min = 5, max = 24 } }'
+)
 SWITCH = "hysteresis of=T setpoint=21 band=0.3 below=0.8 above=0.2"
 HEATERS = {
     "a controller": (TASKS["set point"], "pid of=T setpoint=T_set kp=0.3 ti=20000 td=60", None),
@@ -39,6 +45,9 @@ HEATERS = {
     "a rate": (TASKS["rate"], None, HISTORY),
     "levels": (TASKS["levels"], HEAT, LINEAR),
     "memory": (TASKS["memory"], None, Agent("by hand", None, 1, 1, hidden=8)),
+    "a schedule": ({"agent": PRESENT}, "schedule 00:30=0.7 05:00=0.2 07:00=1", HISTORY),
+    "a table": (PAIR, CASCADE, None),
+    "a table and a history": (PAIR, CASCADE, HISTORY),
     "two actions": (PAIR, None, Agent("by hand", None, 1, 1, hidden=16, history=True)),
 }  # fmt: skip
 
@@ -119,6 +128,19 @@ CONTROLLERS = {
 }
 
 
+TABLES = {
+    "loops": {"u1": "pid of=y1 setpoint=0.3 kp=2 ti=1", "u2": "hysteresis of=y2 setpoint=0 band=1"},
+    "constants": {"u1": 0.25, "u2": -1},
+    "a schedule": {"u1": "schedule 00:00=0.1 00:01=0.3", "u2": "pid of=y2 setpoint=y1 kp=-3"},
+    "a cascade": {
+        "u2": "pid of=y2 setpoint=b kp=-0.6 ti=5 td=0.1",
+        "b": {"controller": "pid of=y1 setpoint=a+y2/9 kp=1 ti=1 offset=0.1", "min": -2, "max": 2},
+        "a": {"controller": "pid of=y2 setpoint=0.5 kp=1 ti=3", "min": -1, "max": 1.5},
+        "u1": "pid of=a+b setpoint=y1 kp=0.4 ti=2",
+    },
+}
+
+
 class Agents:
     """The exported agent, beside its Python policy in an episode."""
 
@@ -141,6 +163,31 @@ class Agents:
             found.append([*made.step(row[places])])
         assert len(np.unique(wanted)) >= (2 if "hysteresis" in name else 50)
         assert found == pytest.approx(np.array(wanted), abs=self.tolerance)
+
+    @pytest.mark.parametrize("name", TABLES)
+    def test_of_tables(self, name, tmp_path, load):
+        """Long enough for signals and actions to be at their limits, and not to be there."""
+        document = BALANCED | {
+            "fmu": str(linear_fmu(tmp_path / "linear.fmu")),
+            "parameters": {},
+            "variables": {n: {"min": -1, "max": 1} for n in ("u1", "u2")},
+            "agent": {"actions": ["u1", "u2"], "observations": ["y1", "y2"]},
+        }
+        env = load(document, physical=True)
+        agent = agent_of(env, controller_from(TABLES[name]))
+        made, controller = exported(agent, tmp_path, self.language), controller_from(TABLES[name])
+        places = [env.observation_names.index(one.name) for one in agent.logic.measurements]
+        waves = np.sin(np.arange(400)[:, None] / [17.0, 31.0])
+        rows = 0.4 * waves + np.random.default_rng(0).normal(size=(400, 2)) / 10
+        for _ in range(2):
+            made.begin()
+            controller.bind(env)
+            wanted = [controller.act(row).tolist() for row in rows.astype(np.float32)]
+            found = [[*made.step(row[places])] for row in rows.astype(np.float32).astype(float)]
+            assert np.array(found) == pytest.approx(np.array(wanted), abs=self.tolerance)
+        assert len(np.unique(wanted)) >= (2 if name == "constants" else 50)
+        if name == "a cascade":
+            assert 20 < np.count_nonzero(np.abs(wanted) == 1) < 700
 
     @pytest.mark.parametrize("task", HEATERS)
     def test_of_task_files(self, task, tmp_path):
@@ -252,10 +299,10 @@ def test_as_an_fmu(version, task, tmp_path):
 
 
 class TestRefused:
-    def test_a_schedule(self):
+    def test_what_has_no_formulas(self):
         env = heater({"agent": PRESENT})
-        with pytest.raises(ConfigError, match=r"Schedule.*PID"):
-            agent_of(env, agent_for(env, "schedule 06:00=1 22:00=0", None))
+        with pytest.raises(ConfigError, match=r"Random.*PID"):
+            agent_of(env, Random())
         env.close()
 
     def test_a_task_in_the_form_for_agents(self, load):
@@ -270,6 +317,23 @@ class TestRefused:
             agent_of(env, agent)
         env.close()
         other.close()
+
+
+def test_a_controller_by_the_command_line(tmp_path, ran, refused):
+    """By its name in the task file, in which another one has ranges."""
+    task = tmp_path / "task.toml"
+    controllers = {
+        "half": 0.5,
+        "wide": "pid of=T setpoint=21 kp=0.1..1",
+        "cascade": table_in(CASCADE),
+    }
+    fmugym.Task.from_dict(HEATING | PAIR | {"controllers": controllers}).write(task)
+    given = "export", "--task", task, "--controller"
+    said = ran(*given, "cascade", "--output", tmp_path / "cascade.c")
+    assert "measurement T_op K" in said
+    assert "action Q_int" in said
+    assert "range" in refused(*given, "wide", "--output", tmp_path / "wide.c")
+    assert "AGENT" in refused("export", "--task", task, "--output", tmp_path / "none.c")
 
 
 def test_by_the_command_line(tmp_path, ran, load):
