@@ -314,6 +314,7 @@ class FMUEnv(Constructed):
             restore, also in another process.
 
         Raises:
+            ConfigError: If hooks have assigned to attributes of the class.
             SimulationError: Before the first reset, after ``close``, if a real system stands in
                 for the FMU, or if the FMU fails.
         """

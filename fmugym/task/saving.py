@@ -21,8 +21,10 @@ __all__ = [
     "READ",
     "columns_of",
     "generator_of",
+    "note_attributes",
     "place_columns",
     "read_columns",
+    "require_quantities",
     "require_saving",
     "row_of",
     "state_of",
@@ -50,16 +52,37 @@ def columns_of(env: Constructed) -> Columns:
 
     Returns:
         Columns of one environment.
+
+    Raises:
+        ConfigError: If it has assigned to attributes of its own.
     """
-    attributes = plain_attributes(vars(env), env.inside.own_names)
+    require_quantities(env)
     streams, seeds = _stream_of(env)
     return read_columns(env, lambda value: [copy.deepcopy(value)]) | {
         "ended": np.array([env.inside.ended]),
         "streams": streams,
         "seeds": seeds,
         "pictured": [env.inside.pictured],
-        "attributes": [changed(attributes, env.inside.as_constructed)],
     }
+
+
+def require_quantities(env: Constructed) -> None:
+    """Refuse to save an episode of which attributes of the class hold a part.
+
+    Raises:
+        ConfigError: If such an attribute has changed since hooks are called.
+    """
+    own = plain_attributes(vars(env), env.inside.own_names)
+    for name in changed(own, env.inside.as_constructed):
+        raise ConfigError(
+            f"the attribute {name!r} of {type(env).__name__} has changed since the first reset, "
+            "and no snapshot holds it: keep it under 'episode_variables', which _update may write"
+        )
+
+
+def note_attributes(env: Constructed) -> None:
+    """Take the attributes of the class for those that it was made with."""
+    env.inside.as_constructed = plain_attributes(vars(env), env.inside.own_names)
 
 
 def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
@@ -99,9 +122,8 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     read.variables.update(
         {name: _native_value(column, place) for name, column in columns["variables"].items()}
     )
-    pictured, attributes = columns["pictured"], columns["attributes"]
+    pictured = columns["pictured"]
     env.inside.pictured = (None, 0.0) if pictured is None else pictured[place]
-    vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
     _place_stream(env, columns, place)
     env.inside.was_reset, env.inside.ended = True, bool(columns["ended"][place])
 

@@ -45,7 +45,7 @@ Column = npt.NDArray[Any] | list[Any]
 """One value for each environment, which comes first."""
 
 Columns = dict[str, Any]
-"""Columns by name; those of the parameters, variables and attributes are dicts again."""
+"""Columns by name; those of the parameters and variables are dicts again."""
 
 Scope = dict[str, str]
 """What an environment must have in common with those of a snapshot, as texts by name."""
@@ -57,8 +57,8 @@ class Snapshot:
     A snapshot is a value. It can be compared, copied and pickled. It fits every environment with
     the same FMU and the same config, single or in a vector environment, in any process. It holds
     the state of the FMU, time, step count, action, previous values, drawn parameters, episode
-    variables and random streams. It also holds what hooks have assigned to attributes of a single
-    environment, as far as these are numbers, texts, arrays, and lists or dicts of them.
+    variables and random streams. Attributes that hooks have assigned are no part of it: then
+    ``save_state`` refuses.
 
     ``snapshot[i]`` is the snapshot of environment i. A mask, a slice or a list of indices chooses
     several.

@@ -364,7 +364,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 None for all.
 
         Raises:
-            ConfigError: If ``where`` does not fit.
+            ConfigError: If ``where`` does not fit, or hooks have assigned to attributes.
             SimulationError: Before the first reset, after ``close``, if real systems stand in for
                 the FMUs, or if an FMU fails.
         """

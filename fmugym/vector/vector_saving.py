@@ -13,7 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.readings import environments_first, environments_last
-from fmugym.task.saving import READ, read_columns
+from fmugym.task.saving import READ, read_columns, require_quantities
 from fmugym.task.snapshot import Columns, Snapshot
 
 __all__ = [
@@ -86,8 +86,9 @@ def which_of(indices: IndexArray, count: int) -> Which:
 
 def columns_of(env: FMUEnv, which: Which) -> Columns:
     """Copy what hooks read in some environments of a batch, whose prototype this is."""
+    require_quantities(env)
     columns = read_columns(env, partial(_rows, which))
-    return columns | {"pictured": None, "attributes": None}
+    return columns | {"pictured": None}
 
 
 def _rows(which: Which, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -114,15 +115,9 @@ def require_fit(columns: Columns) -> None:
     """Refuse what single environments may have, but not those of a batch.
 
     Raises:
-        ConfigError: If hooks have assigned attributes, or the random generator is not a
-            ``numpy.random.PCG64``.
+        ConfigError: If the random generator is not a ``numpy.random.PCG64``.
     """
-    attributes, streams = columns["attributes"] or (), columns["streams"]
-    for name in (name for part in attributes for name in part):
-        raise ConfigError(
-            f"the snapshot has the attribute {name!r}, which the environments of a vector "
-            "environment share; keep it under 'episode_variables'"
-        )
+    streams = columns["streams"]
     if isinstance(streams, list) and any(isinstance(stream, dict) for stream in streams):
         raise ConfigError(
             "the snapshot has a random generator other than numpy.random.PCG64; reset the "

@@ -159,23 +159,30 @@ class TestSingle:
         env.close()
         twin.close()
 
-    def test_has_what_hooks_assign_to_attributes(self, vector_of):
+    @pytest.mark.parametrize("way", ["arrays", "one by one"])
+    def test_refuses_what_hooks_assign_to_attributes(self, way, vector_of):
         class Counting(CartPoleEnv):
+            limit = 3.0
+
             def _update(self):
-                self.pushes = [*getattr(self, "pushes", []), self.time]
+                self.pushes = [*getattr(self, "pushes", []), 1.0]
 
-            def _reward_policy(self):
-                return float(len(self.pushes))
-
+        message = "the attribute 'pushes' of Counting has changed .*'episode_variables'"
         with Counting() as env:
             env.reset(seed=0)
+            env.save_state()
             env.step(1)
-            snapshot = env.save_state()
-            assert [env.step(action)[1] for action in (0, 1)] == [2.0, 3.0]
-            env.restore_state(snapshot)
-            assert env.step(1)[1] == 2.0
-            with pytest.raises(ConfigError, match="pushes"):
-                vector_of(in_way("arrays", CartPoleEnv), 2).restore_state(snapshot)
+            for save in (env.save_state, lambda: copy.deepcopy(env)):
+                with pytest.raises(ConfigError, match=message):
+                    save()
+        envs = vector_of(in_way(way, Counting), 2)
+        envs.reset(seed=0)
+        envs.set_attr("limit", [1.0, 2.0])
+        snapshot = envs.save_state()
+        envs.step(np.array([0, 1]))
+        for save in (envs.save_state, lambda: envs.rollout(snapshot, np.zeros((2, 3), np.int64))):
+            with pytest.raises(ConfigError, match=message):
+                save()
 
     def test_after_a_fault_only_a_reset_can_follow(self, make_env):
         env = make_env(model_parameters={"fault": 3, "fault_step": 2})

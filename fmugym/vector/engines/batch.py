@@ -33,6 +33,7 @@ from fmugym.task.future import assumed
 from fmugym.task.native_draws import no_draws
 from fmugym.task.plain import put_back
 from fmugym.task.readings import Readings, reading
+from fmugym.task.saving import note_attributes
 from fmugym.task.snapshot import Columns
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import array_of, checked_actions
@@ -215,6 +216,7 @@ class BatchEngine(Engine):
             self._columns.pop(name, None)
             if is_row:
                 self._columns[name] = value
+        note_attributes(self.env)
 
     def call(
         self,

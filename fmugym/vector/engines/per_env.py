@@ -24,7 +24,7 @@ from fmugym.task.construction import draws_of, draws_of_reset, prepare_hooks
 from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
-from fmugym.task.saving import columns_of, place_columns
+from fmugym.task.saving import columns_of, note_attributes, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.vector.action_arrays import checked_actions, is_array_space
 from fmugym.vector.codec import gathered, mapped
@@ -90,7 +90,10 @@ class PerEnvEngine(Engine):
     ) -> list[Any]:
         """See ``Engine.call``."""
         values = [self.read(name, index) for index in indices]
-        return [v(*arguments, **keywords) if callable(v) else v for v in values]
+        returned = [v(*arguments, **keywords) if callable(v) else v for v in values]
+        for index in indices:
+            note_attributes(self._envs[index])
+        return returned
 
     def evaluate(
         self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
@@ -102,6 +105,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.set_attribute``; the values may be of any type."""
         for index, value in values.items():
             setattr(self._envs[index], name, value)
+            note_attributes(self._envs[index])
 
     def set_variable(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_variable``."""
