@@ -451,8 +451,10 @@ class MPC(Controller):
             actions.append(chosen[turn, np.arange(self._many)])
             return actions[-1]
 
-        self._copies.rollout(start, policy, horizon=self._plan_shape[0], **assumed)
-        chosen = np.array(actions, np.float64).reshape(*self._plan_shape[:1], self._many, -1)
+        steps = self._plan_shape[0]
+        self._copies.rollout(start, policy, horizon=steps, **assumed)
+        actions += [actions[-1]] * (steps - len(actions))  # nobody asks when all have ended
+        chosen = np.array(actions, np.float64).reshape(steps, self._many, -1)
         plans = (chosen - self._low) / (self._high - self._low)
         return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
 
