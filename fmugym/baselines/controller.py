@@ -163,7 +163,7 @@ class Controller(KnownArguments, ABC):
         """
         raise ConfigError(
             f"a controller of type {type(self).__name__} cannot be exported; a PID, a Hysteresis, "
-            "a Schedule, an LQR and a table of such can be"
+            "a Schedule, a ControllerTable and an LQR can be"
         )
 
     def _names_of(self, env: Any) -> tuple[str, ...]:
@@ -198,8 +198,8 @@ class Controller(KnownArguments, ABC):
         """
         if not isinstance(signal, str):
             return signal
-        formula, of_columns = self._signals[signal]
-        return formula(seen) if isinstance(seen[0], Value) else of_columns(seen)
+        formula, evaluate = self._signals[signal]
+        return formula(seen) if isinstance(seen[0], Value) else evaluate(seen)
 
     def _check_signal(self, what: str, signal: Signal) -> None:
         """Check a signal; one that is no name may be an expression."""

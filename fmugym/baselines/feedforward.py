@@ -101,10 +101,9 @@ class Schedule(Law):
     def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
         """See ``Law.law``; the controller remembers the number of steps."""
         (steps,) = state
-        time = self._start + steps * self.time_step
-        return [self._at(time if self.clock is None else self._value(seen, self.clock))], (
-            steps + 1.0,
-        )
+        counted = self._start + steps * self.time_step
+        time = counted if self.clock is None else self._value(seen, self.clock)
+        return [self._at(time)], (steps + 1.0,)
 
     def _at(self, time: Any) -> Any:
         """The action at a time in seconds since any midnight."""

@@ -149,7 +149,7 @@ def test_masks_need_levels(load):
 MIXED = {
     "fmu": {"bundled": "DoublePendulum"},
     "time_step": "20ms",
-    "episode_length": "1s",
+    "episode_length": "300ms",
     "variables": {"tau1": {"levels": [0.4, -0.2, 0]}, "tau2": {"min": -1, "max": 1}},
     "agent": {"actions": ["tau1", "tau2"], "observations": ["q1", "q2"]},
     "reward": "-q1**2 - q2**2 - 0.1 * previous(tau1)",
