@@ -109,8 +109,8 @@ def test_a_cascade_leads_where_it_leads_as_an_agent(variables, rescale, load):
         for _ in range(STEPS):
             chosen.append(controller.act(observation))
             observation, *_ = driven.step(chosen[-1])
-        wanted = [*driven.inside.readings.values, *driven.inputs]
-        found = [*env.inside.readings.values, *env.inputs]
+        wanted = [*driven.inside.readings.outputs, *driven.inputs]
+        found = [*env.inside.readings.outputs, *env.inputs]
         assert found == (pytest.approx(wanted, rel=1e-5) if rescale else wanted)
         assert {one[1] for one in chosen} == {50.0, 300.0}
         assert len({one[0] for one in chosen}) > 5
