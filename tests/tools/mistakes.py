@@ -104,6 +104,12 @@ POSITIONAL = {
 """Arguments with which each command would begin."""
 
 
+def _first_required(parser):
+    """The name in the usage of the first argument that a command needs."""
+    needed = next((one for one in parser._actions if one.required), None)
+    return "" if needed is None else (needed.option_strings or [needed.metavar])[0]
+
+
 def of_options() -> Iterator[Mistake]:
     """Every command and option misspelt, and every number given as a word."""
     for name, parser in _parser()[1].items():
@@ -117,7 +123,7 @@ def of_options() -> Iterator[Mistake]:
                     kind = "an integer" if action.type is int else "a number"
                     yield command(*given, option, "abc", facts=(option, "'abc'", kind))
         if POSITIONAL[name]:
-            yield command(name, facts=("required", parser._actions[1].metavar or ""))
+            yield command(name, facts=("required", _first_required(parser)))
         yield command(name, *POSITIONAL[name], "--json=1", facts=("--json", "'1'"))
 
 
