@@ -15,7 +15,7 @@ from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
-from fmugym.search.probe import FEW, MOST_PROBED, Probe
+from fmugym.search.probe import FEW, Probe
 
 __all__ = ["VALIDATION", "Search"]
 
@@ -97,7 +97,7 @@ class Search:
     def __init__(self, probe: Probe, seed: int) -> None:
         self.probe, self.seed = probe, seed
         self.episodes = 1 if probe.is_same else _EPISODES
-        self.rounds, self.steps = 0, MOST_PROBED
+        self.rounds, self.steps = 0, probe.steps
         self.rng = np.random.default_rng(seed)
         self.controllers = [
             Entrant(None, one, self.episodes, rounds=_TUNING, best=one)
