@@ -32,7 +32,7 @@ __all__ = [
 MOST_TESTED: Final = 2000
 """Steps of a test, at most, unless somebody says another number."""
 
-_GAINS: Final = 0.1, 100.0
+_GAINS: Final = 0.3, 30.0
 """Gains are tried between these multiples of the inverse of what the plant has."""
 
 _BANDS: Final = 0.01, 0.5
@@ -44,7 +44,8 @@ _TRIED: Final = 2
 _USUAL_STEPS: Final = 100
 """Those of an episode without an end."""
 
-_MOST_TABLES: Final = 3
+_KINDS: Final = "PI", "P"
+_MOST_PAIRINGS: Final = 2
 _MOST_FREE: Final = 10
 """So many values without a set point may have one that is tuned: those that actions move most,
 beside their limits."""
@@ -138,11 +139,14 @@ def _setpoints(document: Mapping[str, Any], env: Any) -> dict[str, list[str | fl
 
 def steps_of_test(loops: Loops, most: int = MOST_TESTED) -> int:
     """The steps of a test, if no episode ends early; at most as many as are given."""
-    episodes = episodes_of(len(loops.actions))
-    return episodes * min(most // episodes, loops.most_steps)
+    return episodes_of(len(loops.actions)) * _steps_of_episode(loops, most)
 
 
-def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -> list[str]:
+def _steps_of_episode(loops: Loops, most: int) -> int:
+    return min(most // episodes_of(len(loops.actions)), loops.most_steps)
+
+
+def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -> dict[str, str]:
     """Test the plant of an arena by steps, and guess controllers; see ``guessed_controllers``.
 
     Args:
@@ -155,13 +159,13 @@ def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -
     """
     if len(loops.actions) > MOST_PAIRED:
         raise ConfigError(f"there are more than {MOST_PAIRED} actions")
-    arena.most_steps = most // episodes_of(len(loops.actions))
+    arena.most_steps = _steps_of_episode(loops, most)
     if arena.most_steps <= FEWEST:
         raise ConfigError(f"{most} steps are too few for a test of the actions")
     return guessed_controllers(loops, step_test(arena, loops.limits))
 
 
-def controllers_for(make_env: Callable[[], Any], seconds: float) -> list[str]:
+def controllers_for(make_env: Callable[[], Any], seconds: float) -> dict[str, str]:
     """Make an environment and guess controllers of its task; see ``guessed_controllers``.
 
     Args:
@@ -178,7 +182,7 @@ def controllers_for(make_env: Callable[[], Any], seconds: float) -> list[str]:
         return suggested_controllers(arena, loops, int(min(MOST_TESTED, most)))
 
 
-def guessed_controllers(loops: Loops, responses: StepResponses) -> list[str]:
+def guessed_controllers(loops: Loops, responses: StepResponses) -> dict[str, str]:
     """The controllers that step responses suggest: one for each action, paired by its gains.
 
     Args:
@@ -186,12 +190,13 @@ def guessed_controllers(loops: Loops, responses: StepResponses) -> list[str]:
         responses: What a test tells.
 
     Returns:
-        Texts for ``search_of``, the best one first. If there are several actions, they are tables.
+        Texts for ``search_of`` by name, the least coupled pairing first. If there are several
+        actions, they are tables.
 
     Raises:
         ConfigError: If there is none. The text says why.
     """
-    return [*_Guess(loops, responses).texts()]
+    return dict(_Guess(loops, responses).controllers())
 
 
 @dataclass(frozen=True)
@@ -201,12 +206,18 @@ class _Guess:
     loops: Loops
     responses: StepResponses
 
-    def texts(self) -> Iterator[str]:
+    def controllers(self) -> Iterator[tuple[str, str]]:
         """See ``guessed_controllers``."""
+        if not np.isfinite(self.responses.responses).any():
+            raise ConfigError(f"constant actions end episodes in {FEWEST} steps or less")
         away = self.responses.runs_away
         if away:
             raise ConfigError(f"constant actions let {', '.join(away)} run away")
-        yield from map(self._text, self._pairings())
+        for number, pairs in enumerate(self._pairings(), 1):
+            texts = {self._text(pairs, kind): kind for kind in reversed(_KINDS)}
+            for text, kind in reversed(texts.items()):
+                name = kind if "pid" in text else "thermostat"
+                yield (name if number == 1 else f"{name} {number}"), text
 
     # Pairings.
 
@@ -237,7 +248,7 @@ class _Guess:
                 for number, pairs in self._paired((*first, *more), columns)
             ]
             if found:
-                return [pairs for _, pairs in sorted(found, key=itemgetter(0))][:_MOST_TABLES]
+                return [pairs for _, pairs in sorted(found, key=itemgetter(0))][:_MOST_PAIRINGS]
         raise ConfigError("no pairing of actions with measured values has positive gains")
 
     def _paired(
@@ -280,33 +291,38 @@ class _Guess:
 
     # Texts.
 
-    def _text(self, pairs: Mapping[int, int]) -> str:
+    def _text(self, pairs: Mapping[int, int], kind: str) -> str:
         texts = {
-            name: self._controller(column, pairs[column])
+            name: self._controller(column, pairs[column], kind)
             if column in pairs
             else self._constant(column)
             for column, name in enumerate(self.loops.actions)
         }
         return text_of(texts) if len(texts) > 1 else next(iter(texts.values()))
 
-    def _controller(self, column: int, row: int) -> str:
-        """A PI controller, or a thermostat for an action that is on or off."""
+    def _controller(self, column: int, row: int, kind: str) -> str:
+        """A P or PI controller, or a thermostat for an action that is on or off.
+
+        A set point that is tuned takes the place of the action where the error is zero.
+        """
         of, gain = self.responses.names[row], self.responses.gains[row, column]
         change = max(abs(gain), abs(self.responses.final[row, column]))
         setpoint, ends = self._setpoint(of), self.responses.ends[:, row]
         words = [f"of={of}", f"setpoint={_range(*ends) if setpoint is None else setpoint}"]
         low, high = self.loops.limits[column]
-        if self.loops.actions[column] not in self.loops.switches:
-            usual = np.sign(gain) * (high - low) / change
-            kp = _range(*(usual * part for part in _GAINS))
+        if self.loops.actions[column] in self.loops.switches:
+            band = _range(*(change * part for part in _BANDS))
+            below, above = (high, low) if gain > 0 else (low, high)
+            words += [f"band={band}", f"below={below}", f"above={above}"]
+            return shlex.join(["hysteresis", *words])
+        usual = np.sign(gain) * (high - low) / change
+        words.append(f"kp={_range(*(usual * part for part in _GAINS))}")
+        if kind == "PI":
             step = self.loops.time_step
-            ti = _range(step, step * self.loops.most_steps)
-            return shlex.join(["pid", *words, f"kp={kp}", f"ti={ti}"])
-        band = _range(*(change * part for part in _BANDS))
-        below, above = (high, low) if gain > 0 else (low, high)
-        return shlex.join(
-            ["hysteresis", *words, f"band={band}", f"below={below}", f"above={above}"]
-        )
+            words.append(f"ti={_range(step, step * self.loops.most_steps)}")
+        elif setpoint is not None:
+            words.append(f"offset={_range(low, high)}")
+        return shlex.join(["pid", *words])
 
     def _constant(self, column: int) -> str:
         """A constant action: a controller without a gain."""

@@ -157,9 +157,11 @@ def _guessed(
     if loops is None:
         return
     try:
-        yield from (Agent("PI", one) for one in suggested_controllers(arena, loops, most_tested))
+        guesses = suggested_controllers(arena, loops, most_tested)
     except ConfigError as error:
         tell(f"no controller is guessed: {error}")
+    else:
+        yield from (Agent(name, text) for name, text in guesses.items())
 
 
 def task_of(env: Any) -> dict[str, Any]:

@@ -36,11 +36,16 @@ _AGREEMENT: Final = 0.5
 depends on the operating point."""
 
 _GROWING: Final = 0.2
-"""A response does not settle if the last quarter adds more than this part of it."""
+_EVENLY: Final = 0.9
+"""A response does not settle if the last quarter adds more than a fifth of it, and no less than
+nine tenths of what the quarter before has added. Otherwise it is only slow."""
 
 _EXPLODING: Final = 1.7
 """A response runs away if each quarter adds more than the one before by this factor. Those in
 proportion to the square of time add twice and 1.5 times as much."""
+
+_FALLING: Final = 1.2
+"""As ``_EXPLODING``, where most episodes end early: what falls has no time to do more."""
 
 _AT_ONCE: Final = 0.9
 
@@ -55,11 +60,13 @@ class StepResponses:
             range: of each of the steps of each action in the first step of an episode, and the
             means of the quarters of an episode; NaN if it is too short. Shape (s, n, 5, k).
         ends: The mean observation of the last quarter of each episode, shape (m, k).
+        end_early: Whether most episodes end before their time.
     """
 
     names: tuple[str, ...]
     responses: FloatArray
     ends: FloatArray
+    end_early: bool
 
     @cached_property
     def _means(self) -> FloatArray:
@@ -88,8 +95,8 @@ class StepResponses:
         sign is sure.
         """
         last, added = self._means[-1], np.diff(self._means[1:], axis=0)
-        is_steady = (added * np.sign(last) > 0).all(axis=0)
-        grows = is_steady & (np.abs(added[-1]) > _GROWING * np.abs(last))
+        grown = added * np.sign(last)
+        grows = (grown[-1] > _GROWING * np.abs(last)) & (grown[-1] > _EVENLY * grown[-2])
         most = np.abs(last).argmax(axis=1)[:, None]
         final = np.where(np.take_along_axis(grows, most, axis=1), added[-1], last)
         return np.where(self._is_sure, final, 0.0)
@@ -103,13 +110,10 @@ class StepResponses:
     @property
     def runs_away(self) -> list[str]:
         """The observations that an action lets grow exponentially."""
-        first, second, third = np.diff(self._means[1:], axis=0)
-        signs = np.sign(self.final)
-        grows = [
-            later * signs > _EXPLODING * one * signs
-            for one, later in ((first, second), (second, third))
-        ]
-        away = (np.logical_and(*grows) & (first * signs > 0) & self._is_sure).any(axis=1)
+        first, second, third = np.diff(self._means[1:], axis=0) * np.sign(self.final)
+        factor = _FALLING if self.end_early else _EXPLODING
+        grows = (first > 0) & (second > factor * first) & (third > factor * second)
+        away = (grows & self._is_sure).any(axis=1)
         return [name for name, one in zip(self.names, away, strict=True) if one]
 
     @property
@@ -152,7 +156,7 @@ def step_test(arena: Arena, limits: Sequence[tuple[float, float]]) -> StepRespon
     actions are held from the beginning on.
 
     Args:
-        arena: Plays the episodes, for at most ``arena.most_steps`` steps each.
+        arena: Plays the episodes. They may be as long as ``arena.most_steps``.
         limits: Those of each action.
     """
     count, (low, high) = len(limits), np.array(limits).T
@@ -166,7 +170,8 @@ def step_test(arena: Arena, limits: Sequence[tuple[float, float]]) -> StepRespon
         found = np.array([_response(twin, one) / _STEP for one in stepped])
         responses += [found[:count], -found[count:]]
     ends = [one[-len(one) // _QUARTERS :].mean(axis=0) for one in courses]
-    return StepResponses(names, np.array(responses), np.array(ends))
+    early = np.mean([len(one) < arena.most_steps for one in courses])
+    return StepResponses(names, np.array(responses), np.array(ends), bool(early > 0.5))
 
 
 def _played(arena: Arena, actions: FloatArray) -> tuple[tuple[str, ...], list[FloatArray]]:

@@ -170,7 +170,7 @@ def _new(arguments: argparse.Namespace) -> None:
 
 def _proposed(model: FMU, folder: Path | None) -> tuple[str, list[str]]:
     """The text of a task file, with controllers that a test of the FMU suggests; and notes."""
-    proposal, controllers = Proposal(model, folder), list[str]()
+    proposal, controllers = Proposal(model, folder), dict[str, str]()
     notes = list(proposal.notes())
     task = Task.from_dict(tomllib.loads(Proposal(model).text()))
     try:

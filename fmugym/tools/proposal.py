@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
@@ -176,11 +177,11 @@ class Proposal:
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
 
-    def text(self, controllers: Sequence[str] = ()) -> str:
+    def text(self, controllers: Mapping[str, str] = MappingProxyType({})) -> str:
         """The TOML file; only comments have letters beyond ASCII.
 
         Args:
-            controllers: Guesses: texts as the command line takes them.
+            controllers: Guesses by name: texts as the command line takes them.
         """
         skeleton = self._skeleton
         head = _HEAD.format(
@@ -305,12 +306,12 @@ def preload_line(paths: Sequence[str]) -> str:
     return f"preload = [{', '.join(map(_quoted, paths))}]"
 
 
-def _controllers(texts: Sequence[str]) -> Iterator[str]:
+def _controllers(guesses: Mapping[str, str]) -> Iterator[str]:
     yield "[controllers]"
-    if texts:
+    if guesses:
         yield "# Guesses, from what steps of the actions do; the least coupled loops come first."
-    for number, text in enumerate(texts, 1):
-        name = "pi" if number == 1 else f"pi_{number}"
+    for guess, text in guesses.items():
+        name = guess.lower().replace(" ", "_")
         if not is_table(text):
             yield f"{name} = {_quoted(text)}"
             continue

@@ -8,7 +8,7 @@ import pytest
 
 import fmugym
 
-ROUNDS = 45
+ROUNDS = 70
 """The tuning of a table, two looks, and some rounds for each class of policies."""
 
 
@@ -70,7 +70,7 @@ def test_train_beats_the_controllers_by_hand(tmp_path, zones):
     path = zones.make_task(tmp_path)
     hand = zones_figures.by_hand(path, 30)
     facts, agent, table = zones_figures.trained(path, tmp_path / "agent", 30, rounds=ROUNDS)
-    assert facts["baseline"] == "tuned PI"
+    assert facts["baseline"] in ("tuned PI", "tuned P")
     for better, worse in ((table, hand), (agent, table)):
         mean, half = zones_figures.gain(better, worse)
         assert mean > half > 0

@@ -235,14 +235,14 @@ def responses_of(task, envs=256):
     make = partial(fmugym.load, task, physical=True)
     with closing(make()) as env:
         loops = Loops.of(task.document, env)
-    with closing(Arena(make, envs)) as arena:
+    with closing(Arena(make, envs, loops.most_steps)) as arena:
         return loops, step_test(arena, loops.limits), arena.steps
 
 
 def guessed(task):
     """By action, what it controls, and whether more of it raises that."""
     loops, responses, _ = responses_of(task)
-    return loops_of(guessed_controllers(loops, responses)[0])
+    return loops_of(guessed_controllers(loops, responses)["PI"])
 
 
 def loops_of(text):
@@ -309,19 +309,26 @@ class TestGuesses:
     def test_gains_of_a_plant_give_the_ranges(self, made):
         """Of the PI controller of the top: 2 lb/min for 25.6 mol %."""
         loops, responses, _ = responses_of(column(made))
-        (text, *_) = guessed_controllers(loops, responses)
+        text = guessed_controllers(loops, responses)["PI"]
         ranges = search_of(text).searches["reflux"].ranges
-        usual = 1 / 12.8
-        assert (ranges["kp"].low, ranges["kp"].high) == pytest.approx(
-            (0.1 * usual, 100 * usual), rel=0.02
-        )
+        gains = ranges["kp"].low, ranges["kp"].high
+        assert gains == pytest.approx((0.3 / 12.8, 30 / 12.8), rel=0.02)
         assert (ranges["ti"].low, ranges["ti"].high) == (60.0, 7200.0)
+
+    def test_proportional_ones_have_an_action_without_error(self, made):
+        """Unless their set point is tuned, which does the same."""
+        loops, responses, _ = responses_of(column(made, reward="-abs(top_set - top)"))
+        searches = search_of(guessed_controllers(loops, responses)["P"]).searches
+        assert {*searches["reflux"].ranges} == {"kp", "offset"}
+        assert {*searches["steam"].ranges} == {"kp", "setpoint"}
+        offset = searches["reflux"].ranges["offset"]
+        assert (offset.low, offset.high) == (-1.0, 1.0)
 
     def test_without_a_set_point_one_is_tuned(self, made):
         """Within what the test has seen there."""
         reward = {"reward": "-abs(top_set - top)"}
         loops, responses, _ = responses_of(column(made, **reward))
-        (text, *_) = guessed_controllers(loops, responses)
+        text = guessed_controllers(loops, responses)["PI"]
         assert loops_of(text) == {"reflux": ("top", True), "steam": ("bottom", False)}
         found = search_of(text).searches["steam"].ranges["setpoint"]
         ends = responses.ends[:, 0]
@@ -331,7 +338,7 @@ class TestGuesses:
         task = column(made)
         task["variables"] |= {"reflux": {"levels": [-1, 0, 1]}, "steam": {"levels": [0, 1]}}
         loops, responses, _ = responses_of(task)
-        (text, *_) = guessed_controllers(loops, responses)
+        text = guessed_controllers(loops, responses)["PI"]
         assert search_of(text).searches["reflux"].kind == "pid"
         steam = search_of(text).searches["steam"]
         assert steam.kind == "hysteresis"

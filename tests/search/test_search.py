@@ -1176,7 +1176,7 @@ class TestSearch:
         assert "of at most 2" in facts["verdict"]
 
     def test_without_controllers_guesses_are_tuned(self, folder):
-        """Of a pendulum that hangs; more torque raises its angle."""
+        """Of a pendulum that hangs."""
         told = []
         hanging = {
             "parameters": {"q_0": 0.0},
@@ -1186,17 +1186,14 @@ class TestSearch:
             "terminated": None,
         }
         facts = searched(folder, rounds=32, controllers=None, told=told, **hanging)
-        assert "PI (to be tuned)" in told[0]
-        assert facts["baseline"] == "tuned PI"
-        assert facts["controller"].startswith("pid of=q setpoint=0.3 kp=")
-        assert " kp=-" not in facts["controller"]
+        assert told[0] == "to be beaten: PI (to be tuned), P (to be tuned)"
+        assert facts["baseline"] in ("tuned PI", "tuned P")
 
     def test_what_runs_away_has_no_guess(self, folder):
         told = []
         falling = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
         facts = searched(folder, rounds=8, **falling)
-        assert any(line.startswith("no controller is guessed: ") for line in told)
-        assert any("theta" in line and "run away" in line for line in told)
+        assert "no controller is guessed: constant actions end episodes in 8 steps or less" in told
         assert facts["baseline"] == "constant action"
 
     def test_without_any_constant_actions_are_tuned(self, folder):
