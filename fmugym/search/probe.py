@@ -16,7 +16,7 @@ from fmugym.declared.likely_units import require_units
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import require_numbers
-from fmugym.search.guessing import guessed_controllers
+from fmugym.search.guessing import MOST_TESTED, Loops, steps_of_test, suggested_controllers
 from fmugym.search.policy import Agent, Policy
 
 __all__ = ["FEW", "MOST_PROBED", "Probe", "task_of"]
@@ -52,6 +52,7 @@ class Probe:
         is_same: Whether all episodes are the same.
         seconds: Real time of a step of one environment among many.
         usual_steps: The steps of an episode: of the longest one, if all have ended early.
+        steps: As many count for the probe.
     """
 
     task: Mapping[str, Any]
@@ -62,15 +63,23 @@ class Probe:
     is_same: bool
     seconds: float
     usual_steps: int
+    steps: int = MOST_PROBED
 
     @classmethod
-    def of(cls, make_env: Callable[[], FMUEnv], envs: int, tell: Callable[[str], None]) -> Probe:
+    def of(
+        cls,
+        make_env: Callable[[], FMUEnv],
+        envs: int,
+        tell: Callable[[str], None],
+        most_tested: int = MOST_TESTED,
+    ) -> Probe:
         """Take some steps with constant actions.
 
         Args:
             make_env: A function that makes the environment.
             envs: The largest number of environments.
             tell: Gets lines about what a user would not expect.
+            most_tested: The most steps of the test by which controllers are guessed.
 
         Raises:
             ConfigError: If no policy can be searched for the task, or its first step always fails.
@@ -79,8 +88,8 @@ class Probe:
             require_numbers(env.observation_space, env.action_space)
             policy, task = Policy(None).bind(env), task_of(env)
             require_units(env)
-            guesses = guessed_controllers(task, env)
             agents = list(_declared(task, env, tell))
+            loops = None if agents else Loops.of(task, env)
             length = most_steps_of(env)
             limits = dict(getattr(env, "cost_limits", {}))
         linear = Agent("linear", None, len(policy.names), policy.acting)
@@ -98,6 +107,8 @@ class Probe:
             if arena.seconds < _QUICK * arena.steps:
                 arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
                 arena.play(linear, rows, seeds)
+            seconds, longest = arena.seconds / arena.steps, arena.longest
+            agents = agents or list(_guessed(arena, loops, tell, most_tested))
         seen = np.dstack([outcome.returns, outcome.moments])
         if np.ptp(outcome.returns) == 0:
             tell(
@@ -110,12 +121,13 @@ class Probe:
         return cls(
             task,
             linear,
-            agents or [Agent("PI", one) for one in guesses] or [constant],
+            agents or [constant],
             limits,
             most_steps,
             is_same=not np.ptp(seen, axis=1).any(),
-            seconds=arena.seconds / arena.steps,
-            usual_steps=arena.longest if arena.longest < _STEPS else most_steps,
+            seconds=seconds,
+            usual_steps=longest if longest < _STEPS else most_steps,
+            steps=MOST_PROBED + (0 if loops is None else steps_of_test(loops, most_tested)),
         )
 
     def round_time(self, episodes: int) -> float:
@@ -138,6 +150,20 @@ def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) ->
                 tell(f"left out: {name}: {error}")
         else:
             yield agent
+
+
+def _guessed(
+    arena: Arena, loops: Loops | None, tell: Callable[[str], None], most_tested: int
+) -> Iterator[Agent]:
+    """Controllers that a step test suggests for some loops."""
+    if loops is None:
+        return
+    try:
+        guesses = suggested_controllers(arena, loops, most_tested)
+    except ConfigError as error:
+        tell(f"no controller is guessed: {error}")
+    else:
+        yield from (Agent(name, text) for name, text in guesses.items())
 
 
 def task_of(env: Any) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
-from fmugym.search.probe import FEW, MOST_PROBED, Probe
+from fmugym.search.probe import FEW, Probe
 
 __all__ = ["VALIDATION", "Search", "tuning_steps"]
 
@@ -44,6 +44,9 @@ _TRIAL: Final = 5
 _TUNING: Final = 20
 """Rounds for the numbers of each controller, and in all for those of the best one. A constant
 action is one, too."""
+
+_A_NUMBER: Final = 6
+"""The best one has at least so many for each of its numbers."""
 
 _SHARE: Final = 10
 """A class of policies has at least this part of all rounds."""
@@ -109,7 +112,7 @@ class Search:
     def __init__(self, probe: Probe, seed: int) -> None:
         self.probe, self.seed = probe, seed
         self.episodes = 1 if probe.is_same else _EPISODES
-        self.rounds, self.steps = 0, MOST_PROBED
+        self.rounds, self.steps = 0, probe.steps
         self.rng = np.random.default_rng(seed)
         self.controllers = [
             Entrant(None, one, self.episodes, rounds=_TUNING, best=one)
@@ -142,7 +145,7 @@ class Search:
         new = min(self.controllers, key=attrgetter("rounds"))
         best = max(self.controllers, key=_MERIT)
         found = new if new.rounds < _TRIAL else best
-        return found if found.rounds < _TUNING else None
+        return found if found.rounds < _most_rounds(found) else None
 
     @property
     def _active(self) -> list[Entrant]:
@@ -280,3 +283,9 @@ class Search:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
         return max(agents, key=lambda one: one.play(arena, seeds).merits[0], default=None)
+
+
+def _most_rounds(controller: Entrant) -> int:
+    """The rounds for the numbers of a controller, if it is the best one."""
+    text = controller.make.text
+    return max(_TUNING, _A_NUMBER * len(search_of(text).ranges) if has_range(text) else 0)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import shutil
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.declared import Task
+from fmugym.declared import Task, load
 from fmugym.declared.format import SCHEMA
-from fmugym.errors import ConfigError, plain
+from fmugym.errors import ConfigError, FMUGymError, plain, reason
 from fmugym.repair.compiling import compile_fmu
 from fmugym.repair.stand_in import build_stand_in, replaceable
+from fmugym.search.guessing import controllers_for
 from fmugym.systems import FMUSystem
 from fmugym.tools.data_overview import data_as_text, overview_of_data
 from fmugym.tools.datasets import show_dataset
@@ -43,6 +45,9 @@ from fmugym.tools.validation import validate
 
 __all__ = ["add_info", "add_new", "add_validate"]
 
+
+_SECONDS: Final = 10.0
+"""Real time for the test of an FMU for which controllers are guessed."""
 
 _SCHEMA_NAME: Final = "fmugym.schema.json"
 _NO_DATA: Final = {"series": (), "error": None}
@@ -148,10 +153,12 @@ def add_new(commands: Commands) -> None:
 def _new(arguments: argparse.Namespace) -> None:
     model, output = open_model(arguments.fmu), arguments.output
     folder = None if output is None else output.parent
-    make = Skeleton if arguments.as_class else Proposal
-    made: Skeleton | Proposal = make(model, folder)
-    text, notes, has_schema = made.text(), list(made.notes()), output and not arguments.as_class
-    if has_schema:
+    if arguments.as_class:
+        skeleton = Skeleton(model, folder)
+        text, notes = skeleton.text(), list(skeleton.notes())
+    else:
+        text, notes = _proposed(model, folder)
+    if output is not None and not arguments.as_class:
         text = f"{_SCHEMA_LINE}{text}"
         shutil.copyfile(SCHEMA, output.parent / _SCHEMA_NAME)
     if output is not None or not arguments.json:
@@ -159,6 +166,18 @@ def _new(arguments: argparse.Namespace) -> None:
     if arguments.json:
         content = {"program": text} if arguments.as_class else {"task": tomllib.loads(text)}
         say_json({"output": output, **content, "notes": notes})
+
+
+def _proposed(model: FMU, folder: Path | None) -> tuple[str, list[str]]:
+    """The text of a task file, with controllers that a test of the FMU suggests; and notes."""
+    proposal, controllers = Proposal(model, folder), dict[str, str]()
+    notes = list(proposal.notes())
+    task = Task.from_dict(tomllib.loads(Proposal(model).text()))
+    try:
+        controllers = controllers_for(partial(load, task, physical=True), _SECONDS)
+    except FMUGymError as error:
+        notes.append(f"no controller is guessed: {reason(error)}")
+    return proposal.text(controllers), notes
 
 
 def add_validate(commands: Commands) -> None:

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
-
-import numpy as np
 
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
+from fmugym.baselines.table_texts import is_table, table_in
 from fmugym.declared.declarations import is_reserved
 from fmugym.declared.likely_units import likely_units
 from fmugym.errors import ConfigError, plain
-from fmugym.search.guessing import both_controllers
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 from fmugym.tools.skeleton import (
@@ -178,8 +177,12 @@ class Proposal:
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
 
-    def text(self) -> str:
-        """The TOML file; only comments have letters beyond ASCII."""
+    def text(self, controllers: Mapping[str, str] = MappingProxyType({})) -> str:
+        """The TOML file; only comments have letters beyond ASCII.
+
+        Args:
+            controllers: Guesses by name: texts as the command line takes them.
+        """
         skeleton = self._skeleton
         head = _HEAD.format(
             file=plain(self._fmu.path.name),
@@ -194,7 +197,7 @@ class Proposal:
         return "\n".join(
             [
                 *(head, *self._variables(), *self._results(), "", *self._setpoints(), ""),
-                *(*self._agent(), "", *self._controllers(), ""),
+                *(*self._agent(), "", *_controllers(controllers), ""),
                 *(*self._parameters(), *self._config(), *self._foreign(), ""),
             ]
         )
@@ -272,20 +275,6 @@ class Proposal:
         yield "[setpoints]"
         yield f"{self._setpoint} = {drawn}  # TODO: a guess; a number is constant"
 
-    def _controllers(self) -> Iterator[str]:
-        """PI controllers of a single action, with both signs."""
-        yield "[controllers]"
-        if len(self._actions) > 1:
-            yield "# None: each gives one action, but there are several."
-            return
-        of, (low, high) = self._aliases[self._goal.name], guessed_bounds(self._actions[0])
-        gain = (high - low) / -np.subtract(*_ends_of_setpoint(self._goal))
-        times = self._skeleton.time_step, self._length()
-        yield f"# Guesses: the first one if more of the action raises {of}, or else the second."
-        texts = both_controllers(of, self._setpoint, gain, times)
-        for name, text in zip(("pi", "pi_reversed"), texts, strict=True):
-            yield f"{name} = {_quoted(text)}"
-
     def _parameters(self) -> Iterator[str]:
         """Parameters as comments: a task need not set any."""
         yield "[parameters]"
@@ -315,6 +304,19 @@ class Proposal:
 def preload_line(paths: Sequence[str]) -> str:
     """The line that names libraries, for the table ``[foreign]`` of a task file."""
     return f"preload = [{', '.join(map(_quoted, paths))}]"
+
+
+def _controllers(guesses: Mapping[str, str]) -> Iterator[str]:
+    yield "[controllers]"
+    if guesses:
+        yield "# Guesses, from what steps of the actions do; the least coupled loops come first."
+    for guess, text in guesses.items():
+        name = guess.lower().replace(" ", "_")
+        if not is_table(text):
+            yield f"{name} = {_quoted(text)}"
+            continue
+        yield f"[controllers.{name}]"
+        yield from (f"{_key(action)} = {_quoted(one)}" for action, one in table_in(text).items())
 
 
 def _scalar_or_array(variable: Variable) -> str:

@@ -20,6 +20,7 @@ from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reading, reason, shown
 from fmugym.files import replaced_together
+from fmugym.search.guessing import MOST_TESTED
 from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
@@ -38,6 +39,9 @@ _FEWEST: Final = 20
 
 _ENOUGH: Final = 100
 """In the time of so many, policies come to gain, too."""
+
+_TESTED: Final = 4
+"""The steps of an FMU by which controllers are guessed are at most one in so many."""
 
 _SLOW: Final = 3e-4
 _GROUP: Final = 8
@@ -132,7 +136,8 @@ class Searching:
             raise ConfigError(
                 f"{self.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
             )
-        probe = Probe.of(self.make_env, self.envs, self.tell)
+        tested = int(min(MOST_TESTED, (self.steps - MOST_PROBED) / _TESTED))
+        probe = Probe.of(self.make_env, self.envs, self.tell, tested)
         agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
         self.tell(f"to be beaten: {', '.join(dict.fromkeys(agents))}")
         self.folder.mkdir(parents=True, exist_ok=True)

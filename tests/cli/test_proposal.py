@@ -69,15 +69,15 @@ def test_an_output_follows_a_set_point_that_the_agent_sees(new):
     assert "guesses: 'T_air' follows 'T_air_set'" in notes
 
 
-def test_a_controller_of_one_action_has_both_signs(new):
-    one, _ = new(fmugym.bundled_fmu("CartPole"))
-    starts = [text.split("ti=")[0] for text in one["controllers"].values()]
-    assert starts == [
-        "pid of=x setpoint=x_set kp=20..2e+05 ",
-        "pid of=x setpoint=x_set kp=-2e+05..-20 ",
-    ]
+def test_controllers_have_the_sign_of_the_plant(new):
+    """More heating raises the temperature; a table has an entry for each motor of two pendulums."""
+    one, _ = new(fmugym.bundled_fmu("House"))
+    assert {*one["controllers"]} == {"pi", "p"}
+    for text in one["controllers"].values():
+        assert text.startswith("pid of=T_air setpoint=T_air_set kp=")
+        assert " kp=-" not in text
     two, _ = new(fmugym.bundled_fmu("DoublePendulum"))
-    assert two["controllers"] == {}
+    assert all(set(table) == set(two["agent"]["actions"]) for table in two["controllers"].values())
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,6 @@ from fmugym.baselines.parsing import search_of
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
 from fmugym.search.flattening import require_numbers, rows_of
-from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import AGENT, LIMIT, Agent, Policy, scale_of
 from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
@@ -1058,88 +1057,6 @@ class TestRanges:
             load(controllers={"pi": text})()
 
 
-CONTROLLED = {
-    "fmu": {"bundled": "Pendulum"},
-    "time_step": 0.05,
-    "episode_length": "10s",
-    "variables": {
-        "tau": {"min": -0.1, "max": 0.3},
-        "q": {"min": -2, "max": 2},
-    },
-    "agent": {"actions": ["tau"], "observations": ["q", "q_dot", "goal"]},
-    "setpoints": {"goal": 1.0},
-}
-
-
-class TestGuesses:
-    @pytest.mark.parametrize(
-        ("changes", "pairs"),
-        [
-            ({"reward": "-abs(q - goal)"}, {("q", "goal")}),
-            ({"reward": "-(goal - q)**2"}, {("q", "goal")}),
-            (
-                {
-                    "reward": {
-                        "a": "-(q - 0.5)**2",
-                        "b": {"expr": "-abs(q_dot - goal)", "weight": 2},
-                    }
-                },
-                {("q", "0.5"), ("q_dot", "goal")},
-            ),
-            ({"reward": "-error**2", "expressions": {"error": "0.25 - q"}}, {("q", "0.25")}),
-            ({"reward": "-tau**2", "costs": {"far": {"expr": "max(q - 1, 0)"}}}, {("q", "1.0")}),
-            ({"reward": "-tau**2 - q * goal - q_dot"}, set()),
-            ({"reward": "1 - goal"}, set()),
-            ({"reward": "-abs(q - phi)", "variables": {"phi": {"name": "theta"}}}, set()),
-            (
-                {
-                    "reward": 1,
-                    "setpoints": {"goal": {"value": 1.0, "of": "q"}},
-                },
-                {("q", "goal")},
-            ),
-        ],
-        ids=[
-            "reward",
-            "reversed",
-            "terms",
-            "expression",
-            "costs",
-            "none",
-            "set point",
-            "unseen",
-            "of",
-        ],
-    )
-    def test_come_from_differences(self, changes, pairs):
-        changes = {"variables": CONTROLLED["variables"] | changes.pop("variables", {})} | changes
-        texts = guesses(**changes)
-        found = [(search_of(text).fixed["of"], search_of(text).fixed["setpoint"]) for text in texts]
-        assert {(of, str(setpoint)) for of, setpoint in found} == pairs
-        assert len(texts) == 2 * len(pairs)
-
-    def test_have_both_signs_and_ranges_of_the_task(self):
-        """The action has 0.4 Nm, and what is measured 4 rad, so that 0.1 Nm/rad is usual."""
-        first, second = map(search_of, guesses(reward="-abs(q - goal)"))
-        assert first.ranges == second.ranges
-        assert {first.negative, second.negative} == {frozenset(), frozenset({"kp"})}
-        gain, time = first.ranges["kp"], first.ranges["ti"]
-        assert (gain.low, gain.high) == pytest.approx((0.001, 10.0))
-        assert (time.low, time.high) == pytest.approx((0.05, 10.0))
-
-    def test_need_one_box_action(self):
-        levels = CONTROLLED["variables"] | {"tau": {"levels": [-0.1, 0.1]}}
-        assert guesses(reward="-abs(q - goal)", variables=levels, physical=False) == []
-        with closing(fmugym.envs.CartPoleEnv()) as env:
-            assert guessed_controllers({"reward": "x - 1"}, env) == []
-
-
-def guesses(physical=True, **changes):
-    document = CONTROLLED | changes
-    with closing(fmugym.load(fmugym.Task.from_dict(document), physical=physical)) as env:
-        return guessed_controllers(env.task.document, env)
-
-
 CONTROLLERS = {"lazy": "schedule 00:00=0", "pi": "pid of=theta setpoint=0 kp=0.01..2 td=0.2"}
 ROUNDS = 60  # enough for the tuning of one controller, and for the leaders among the policies
 
@@ -1259,11 +1176,25 @@ class TestSearch:
         assert "of at most 2" in facts["verdict"]
 
     def test_without_controllers_guesses_are_tuned(self, folder):
+        """Of a pendulum that hangs."""
         told = []
-        guessed = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
-        facts = searched(folder, rounds=32, **guessed)
-        assert "PI (to be tuned)" in told[0]
-        assert facts["baseline"] == "tuned PI"
+        hanging = {
+            "parameters": {"q_0": 0.0},
+            "variables": {"tau": {"min": -0.03, "max": 0.03}},
+            "agent": {"actions": ["tau"], "observations": ["q", "q_dot"]},
+            "reward": "-abs(q - 0.3)",
+            "terminated": None,
+        }
+        facts = searched(folder, rounds=32, controllers=None, told=told, **hanging)
+        assert told[0] == "to be beaten: PI (to be tuned), P (to be tuned)"
+        assert facts["baseline"] in ("tuned PI", "tuned P")
+
+    def test_what_runs_away_has_no_guess(self, folder):
+        told = []
+        falling = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
+        facts = searched(folder, rounds=8, **falling)
+        assert "no controller is guessed: constant actions end episodes in 8 steps or less" in told
+        assert facts["baseline"] == "constant action"
 
     def test_without_any_constant_actions_are_tuned(self, folder):
         told = []

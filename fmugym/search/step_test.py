@@ -1,0 +1,199 @@
+"""Step responses of a task: what each action does to each observation in the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.baselines.arena import Arena
+from fmugym.baselines.controller import Controller, FloatArray
+
+__all__ = ["FEWEST", "StepResponses", "episodes_of", "step_test"]
+
+BoolArray = npt.NDArray[np.bool_]
+
+_POINTS: Final = (0.25, 0.5, 0.75)
+"""Operating points: all actions are at this part of their ranges."""
+
+_STEP: Final = 0.125
+"""By this part of its range, an action is stepped up and down."""
+
+_SEED: Final = 0
+_QUARTERS: Final = 4
+FEWEST: Final = 2 * _QUARTERS
+"""A response of so many steps tells nothing."""
+
+_NOTHING: Final = 1e-6
+"""A response that is smaller than this part of what is observed is none."""
+
+_AGREEMENT: Final = 0.5
+"""The least ratio of the mean of all responses to that of their magnitudes; below it, the sign
+depends on the operating point."""
+
+_GROWING: Final = 0.2
+_EVENLY: Final = 0.9
+"""A response does not settle if the last quarter adds more than a fifth of it, and no less than
+nine tenths of what the quarter before has added. Otherwise it is only slow."""
+
+_EXPLODING: Final = 1.7
+"""A response runs away if each quarter adds more than the one before by this factor. Those in
+proportion to the square of time add twice and 1.5 times as much."""
+
+_FALLING: Final = 1.2
+"""As ``_EXPLODING``, where most episodes end early: what falls has no time to do more."""
+
+_AT_ONCE: Final = 0.9
+
+
+@dataclass(frozen=True)
+class StepResponses:
+    """What k observations do if each of n actions is stepped.
+
+    Attributes:
+        names: Of the observations.
+        responses: Differences to the unstepped twins, beside the step as a part of the action's
+            range: of each of the steps of each action in the first step of an episode, and the
+            means of the quarters of an episode; NaN if it is too short. Shape (s, n, 5, k).
+        ends: The mean observation of the last quarter of each episode, shape (m, k).
+        end_early: Whether most episodes end before their time.
+    """
+
+    names: tuple[str, ...]
+    responses: FloatArray
+    ends: FloatArray
+    end_early: bool
+
+    @cached_property
+    def _means(self) -> FloatArray:
+        """Those of all steps, shape (5, k, n)."""
+        known = np.isfinite(self.responses[..., :1, :1])
+        count = np.maximum(known.sum(axis=0), 1)
+        means: FloatArray = (np.where(known, self.responses, 0.0).sum(axis=0) / count).T
+        return means.swapaxes(0, 1)
+
+    @property
+    def _is_sure(self) -> BoolArray:
+        """Whether there is a response whose sign does not depend on the operating point."""
+        last = np.nan_to_num(self.responses[:, :, -1])
+        known = np.maximum(np.isfinite(self.responses[:, :, -1]).sum(axis=0), 1)
+        magnitude = (np.abs(last).sum(axis=0) / known).T
+        sizes = np.abs(self.ends).max(axis=0)[:, None]
+        agrees = np.abs(self._means[-1]) >= _AGREEMENT * magnitude
+        sure: BoolArray = agrees & (magnitude > _NOTHING * sizes)
+        return sure
+
+    @property
+    def gains(self) -> FloatArray:
+        """The final changes by the range of an action, shape (k, n).
+
+        They are what the last quarter adds, for observations that do not settle, and 0 where no
+        sign is sure.
+        """
+        last, added = self._means[-1], np.diff(self._means[1:], axis=0)
+        grown = added * np.sign(last)
+        grows = (grown[-1] > _GROWING * np.abs(last)) & (grown[-1] > _EVENLY * grown[-2])
+        most = np.abs(last).argmax(axis=1)[:, None]
+        final = np.where(np.take_along_axis(grows, most, axis=1), added[-1], last)
+        return np.where(self._is_sure, final, 0.0)
+
+    @property
+    def final(self) -> FloatArray:
+        """The mean changes in the last quarter of an episode by the range of an action."""
+        last: FloatArray = self._means[-1]
+        return last
+
+    @property
+    def runs_away(self) -> list[str]:
+        """The observations that an action lets grow exponentially."""
+        first, second, third = np.diff(self._means[1:], axis=0) * np.sign(self.final)
+        factor = _FALLING if self.end_early else _EXPLODING
+        grows = (first > 0) & (second > factor * first) & (third > factor * second)
+        away = (grows & self._is_sure).any(axis=1)
+        return [name for name, one in zip(self.names, away, strict=True) if one]
+
+    @property
+    def is_instant(self) -> BoolArray:
+        """Which observations tell what an action is: they do not change later, shape (k,)."""
+        first, last = np.abs(self._means[[0, -1]])
+        return ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
+
+
+class _Held(Controller):
+    """Holds an action in each environment, and keeps what is observed."""
+
+    def __init__(self, actions: FloatArray) -> None:
+        self.actions = actions
+        self.rows: list[FloatArray] = []
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        self.rows.append(rows.copy())
+        return self.actions
+
+    @property
+    def moments(self) -> FloatArray:
+        """One in each step, so that their sum is the length of an episode."""
+        return np.ones((1, self.count))
+
+    def course(self, length: int) -> FloatArray:
+        """What was observed in so many steps, shape (length, N, k); the last one is repeated."""
+        return np.stack([*self.rows, *self.rows[-1:] * (length - len(self.rows))])
+
+
+def episodes_of(actions: int) -> int:
+    """How many episodes the test of so many actions has."""
+    return len(_POINTS) * (1 + 2 * actions)
+
+
+def step_test(arena: Arena, limits: Sequence[tuple[float, float]]) -> StepResponses:
+    """Step each action up and down at three operating points, beside an unstepped twin.
+
+    All episodes have the same seed, so that noise and disturbances cancel in the differences. The
+    actions are held from the beginning on.
+
+    Args:
+        arena: Plays the episodes. They may be as long as ``arena.most_steps``.
+        limits: Those of each action.
+    """
+    count, (low, high) = len(limits), np.array(limits).T
+    unit = np.eye(count)
+    steps = np.concatenate([np.zeros((1, count)), unit, -unit])
+    parts = np.concatenate([point + _STEP * steps for point in _POINTS])
+    names, courses = _played(arena, low + parts * (high - low))
+    responses = []
+    for first in range(0, len(courses), len(steps)):
+        twin, *stepped = courses[first : first + len(steps)]
+        found = np.array([_response(twin, one) / _STEP for one in stepped])
+        responses += [found[:count], -found[count:]]
+    ends = [one[-len(one) // _QUARTERS :].mean(axis=0) for one in courses]
+    early = np.mean([len(one) < arena.most_steps for one in courses])
+    return StepResponses(names, np.array(responses), np.array(ends), bool(early > 0.5))
+
+
+def _played(arena: Arena, actions: FloatArray) -> tuple[tuple[str, ...], list[FloatArray]]:
+    """Play an episode with each action; returns what is observed, each of shape (T, k)."""
+    controllers: list[_Held] = []
+
+    def make(rows: FloatArray) -> Controller:
+        controllers.append(_Held(rows))
+        return controllers[-1]
+
+    lengths = arena.play(make, actions, [_SEED], has_moments=True).moments[:, 0, 0]
+    longest = max(len(one.rows) for one in controllers)
+    rows = np.concatenate([one.course(longest) for one in controllers], axis=1)
+    courses = [rows[: int(length), who] for who, length in enumerate(lengths)]
+    return controllers[0].names, courses
+
+
+def _response(twin: FloatArray, stepped: FloatArray) -> FloatArray:
+    """The difference in the first step, and in the means of quarters, shape (5, k)."""
+    length = min(len(twin), len(stepped))
+    if length <= FEWEST:
+        return np.full((1 + _QUARTERS, twin.shape[1]), np.nan)
+    difference = stepped[1:length] - twin[1:length]
+    quarters = np.array_split(difference, _QUARTERS)
+    return np.stack([difference[0], *(one.mean(axis=0) for one in quarters)])
