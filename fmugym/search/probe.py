@@ -29,11 +29,14 @@ _STEPS: Final = 100
 """So many constant actions play so many episodes, until their ends or for so many steps."""
 
 _QUICK: Final = 2e-3
+_TRIED: Final = 2
+"""Steps that tell how long all others would take."""
+
 _TIMED: Final = 25
 """If a step takes less than this in seconds, as many candidates as in a round tell its time by so
 many steps: the overhead of a call is for all of them."""
 
-MOST_PROBED: Final = _EPISODES * (_ACTIONS * _STEPS + FEW * _TIMED)
+MOST_PROBED: Final = _EPISODES * (_ACTIONS * (_TRIED + _STEPS) + FEW * _TIMED)
 """The steps of a probe, at most. As many count, since how many there are depends on the time."""
 
 
@@ -63,13 +66,24 @@ class Probe:
     usual_steps: int
 
     @classmethod
-    def of(cls, make_env: Callable[[], FMUEnv], envs: int, tell: Callable[[str], None]) -> Probe:
+    def of(
+        cls,
+        make_env: Callable[[], FMUEnv],
+        envs: int,
+        tell: Callable[[str], None],
+        most: int = MOST_PROBED,
+        backend: Any = "auto",
+        seconds: float = np.inf,
+    ) -> Probe:
         """Take some steps with constant actions.
 
         Args:
             make_env: A function that makes the environment.
             envs: The largest number of environments.
             tell: Gets lines about what a user would not expect.
+            most: The largest number of steps.
+            backend: See ``FMUVectorEnv``.
+            seconds: How long the steps may take.
 
         Raises:
             ConfigError: If no policy can be searched for the task, or its first step always fails.
@@ -94,15 +108,22 @@ class Probe:
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
-        with closing(Arena(make_env, envs, _STEPS)) as arena:
+        steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
+        with closing(Arena(make_env, envs, _TRIED, backend=backend)) as arena:
             seeds = range(_EPISODES)
+            if seconds < np.inf:
+                arena.play(linear, rows[:_ACTIONS], seeds)
+                steps = int(
+                    min(steps, max(_TRIED, steps * seconds / (most * arena.seconds / arena.steps)))
+                )
+            arena.most_steps, arena.seconds, arena.steps, arena.longest = steps, 0.0, 0, 0
             outcome = arena.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
             if arena.steps == outcome.costs[..., -1].sum():
                 raise ConfigError(
                     f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
                     "'fmugym validate' tells more"
                 )
-            if arena.seconds < _QUICK * arena.steps:
+            if most == MOST_PROBED and steps == _STEPS and arena.seconds < _QUICK * arena.steps:
                 arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
                 arena.play(linear, rows, seeds)
         seen = np.dstack([outcome.returns, outcome.moments])
@@ -122,7 +143,7 @@ class Probe:
             most_steps,
             is_same=not np.ptp(seen, axis=1).any(),
             seconds=arena.seconds / arena.steps,
-            usual_steps=arena.longest if arena.longest < _STEPS else most_steps,
+            usual_steps=arena.longest if arena.longest < steps else most_steps,
         )
 
     def round_time(self, episodes: int) -> float:
