@@ -95,7 +95,7 @@ def read_begin(
     fixed = {name: numbers[0] for name, numbers in files.items() if len(numbers) == 1}
     free = []
     for start, *numbers in product(starts, *(files[name] for name in named)):
-        own = fixed | dict(zip(named, numbers, strict=True))
+        own: dict[str, Any] = fixed | dict(zip(named, numbers, strict=True))
         if not any(one.overlaps(start - before, before + length, own) for one in excluded):
             free.append((start, *numbers))
     if not free:

@@ -224,7 +224,8 @@ class _Guess:
     @cached_property
     def _moved(self) -> Mapping[str, bool]:
         """Whether actions move an observation, by its name."""
-        moved = self.responses.gains.any(axis=1).tolist()
+        gains: Any = self.responses.gains
+        moved = [bool(row.any()) for row in gains]
         return dict(zip(self.responses.names, moved, strict=True))
 
     def _setpoint(self, of: str) -> str | float | None:

@@ -31,6 +31,7 @@ from fmugym.episodes.simulation import action_of
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
 from fmugym.fmi.words import asked_for
+from fmugym.search.probe import MOST_PROBED
 from fmugym.search.search import tuning_steps
 from fmugym.series.choice import quantities_of
 from fmugym.task.quantity import Quantity
@@ -575,7 +576,8 @@ def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
     texts, names = named_controllers(given), env.action_names or ()
     wrong, moved = _tried(env, task, texts) if texts else ([], set[str]())
     yield from wrong
-    steps = f"{tuning_steps(most_steps_of(env), not env.inside.draws.drawn_names):,} steps at most"
+    most = MOST_PROBED + tuning_steps(most_steps_of(env), not env.inside.draws.drawn_names)
+    steps = f"{most:,} steps at most"
     if texts and not wrong:
         tuned = ", ".join(name for name, one in texts.items() if has_range(one))
         more = f"; 'fmugym train' tunes {tuned} with {steps} each" if tuned else ""

@@ -1,0 +1,172 @@
+"""Excitation: actions that show what an FMU does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from typing import Any, Final, Self
+
+import numpy as np
+from gymnasium import spaces
+
+from fmugym.baselines.arena import Arena
+from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.parsing import has_range, search_of
+from fmugym.search.flattening import choices_of
+from fmugym.search.policy import Agent, Policy
+from fmugym.search.probe import Probe
+from fmugym.surrogate.courses import Courses
+from fmugym.surrogate.surrogate import Surrogate
+from fmugym.surrogate.surrogate_fit import fit
+
+__all__ = ["Excitation", "excite", "fitted_surrogate"]
+
+_RANDOM: Final = 0.4
+"""The part of segments with an action at random,"""
+
+_SHIFTED: Final = 0.3
+"""of those that shift the action of the controller,"""
+
+_AT_AN_END: Final = 0.3
+"""and of random actions that are an end of their range."""
+
+_SHIFT: Final = 0.3
+"""The largest shift, as a part of the range."""
+
+_SEEDS: Final = 500_000
+"""Seeds are smaller than those of validations."""
+
+_LONGEST: Final = 16
+"""The steps of a segment are between 1 and so many, short ones as often as long ones."""
+
+
+_STARTS: Final = 32
+"""Starts of episodes without a step, which tell how episodes begin."""
+
+_GROUP: Final = 8
+_OF_PROBE: Final = 20
+"""The look at a task takes one step of so many."""
+
+_EPISODES: Final = 8
+"""Steps are divided among so many episodes, or more if these are shorter."""
+
+
+def fitted_surrogate(make_env: Callable[[], Any], steps: int, seed: int = 0) -> Surrogate:
+    """Excite an FMU, and fit a surrogate to what it does.
+
+    Args:
+        make_env: Makes the environment, in the physical form of its task.
+        steps: The steps of the FMU, at most.
+        seed: Of episodes and actions.
+
+    Raises:
+        ConfigError: If no policy can be searched for the task, or its first step always fails.
+    """
+    courses, rng = Courses(), np.random.default_rng(seed)
+    most = max(_GROUP, steps // _OF_PROBE)
+    probe = Probe.of(make_env, _GROUP, lambda line: None, most, courses)
+    length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
+    with closing(Arena(make_env, _GROUP, length, backend=courses)) as arena:
+        excite(arena, courses, probe, (steps - courses.steps) // length, rng)
+    return fit(courses)
+
+
+def excite(
+    arena: Arena, courses: Courses, probe: Probe, count: int, rng: np.random.Generator
+) -> None:
+    """Play episodes with the untuned controllers of a task, whose actions are disturbed.
+
+    Args:
+        arena: Its episodes are no longer than they shall be; its backend are the courses.
+        courses: Keep what the FMU does.
+        probe: What is known of the task.
+        count: How many episodes there are.
+        rng: Draws episodes and actions.
+    """
+    seeds = [0] * count if probe.is_same else rng.integers(_SEEDS, size=count).tolist()
+    for place, agent in enumerate(probe.agents):
+        own = seeds[place :: len(probe.agents)]
+        if own:
+            made = _excitations(agent, int(rng.integers(_SEEDS)))
+            arena.play(made, np.zeros((1, 1)), own)
+    envs = arena.open(1)
+    starts = rng.integers(_SEEDS, size=_STARTS)
+    for begin in range(0, _STARTS, envs.num_envs):
+        before = courses.steps
+        envs.reset(seed=np.resize(starts[begin:], envs.num_envs).tolist())
+        if probe.is_same or courses.steps > before:  # warm-ups take steps, too
+            return
+
+
+def _excitations(agent: Agent, seed: int) -> Callable[[FloatArray], Any]:
+    """A function that makes the excitations of one group of episodes after another."""
+    first = 0
+
+    def made(rows: FloatArray) -> Excitation:
+        nonlocal first
+        begin, first = first, first + len(rows)
+        return Excitation(_untuned(agent), seed, begin)
+
+    return made
+
+
+def _untuned(agent: Agent) -> Policy:
+    """An agent whose numbers are in the middle of their ranges."""
+    if has_range(agent.text):
+        middle = np.full(len(search_of(agent.text).ranges), 0.5)
+        return agent.with_numbers(middle).policy()
+    return agent.policy() if agent.is_found else Policy(None)
+
+
+class Excitation:
+    """A controller whose actions are replaced or shifted for some steps at a time.
+
+    Args:
+        controller: The controller.
+        seed: Of the segments.
+        first: The number of the first episode among those with this seed, so that episodes do not
+            depend on how many environments step together.
+    """
+
+    def __init__(self, controller: Controller, seed: int, first: int = 0) -> None:
+        self._controller, self._seed, self._first = controller, seed, first
+
+    def bind(self, env: Any) -> Self:
+        """See ``Controller.bind``."""
+        self._controller.bind(env)
+        space: Any = env.single_action_space
+        self._shape, self._dtype = (env.num_envs, *space.shape), env.action_space.dtype
+        self._is_discrete = bool(choices_of(space))
+        if self._is_discrete:
+            counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
+            self._low = np.broadcast_to(getattr(space, "start", 0), space.shape)
+            self._high = self._low + np.asarray(counts) - 1
+        else:
+            self._low, self._high = space.low, space.high
+        places = range(self._first, self._first + env.num_envs)
+        self._rngs = [np.random.default_rng([self._seed, place]) for place in places]
+        self._left = np.zeros(self._shape, int)
+        self._kind: Any = np.zeros(self._shape)
+        self._value: Any = np.zeros(self._shape)
+        return self
+
+    def act(self, observation: Any, info: Any = None) -> Any:
+        """See ``Controller.act``."""
+        self._begin_segments(self._left <= 0)
+        self._left -= 1
+        base = np.asarray(self._controller.act(observation, info), np.float64)
+        width = self._high - self._low
+        shifted = base + self._value * width
+        action = np.where(self._kind == 1, self._low + self._value * width, base)
+        action = np.clip(np.where(self._kind == 2, shifted, action), self._low, self._high)
+        return (np.rint(action) if self._is_discrete else action).astype(self._dtype)
+
+    def _begin_segments(self, mask: Any) -> None:
+        for place in zip(*np.nonzero(mask), strict=True):
+            rng = self._rngs[place[0]]
+            drawn, level, end, shift, length = rng.uniform(size=5)
+            is_random, is_shifted = drawn < _RANDOM, drawn < _RANDOM + _SHIFTED
+            self._kind[place] = 1 if is_random else 2 if is_shifted else 0
+            level = round(level) if end < _AT_AN_END else level
+            self._value[place] = level if is_random else _SHIFT * (2.0 * shift - 1.0)
+            self._left[place] = int((_LONGEST + 1.0) ** length)

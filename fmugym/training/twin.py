@@ -1,0 +1,220 @@
+"""A search on a surrogate of an FMU, whose result is proved on the FMU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Final, NamedTuple
+
+from fmugym.baselines.arena import Arena, Merit, Outcome
+from fmugym.errors import ConfigError
+from fmugym.search.excitation import excite
+from fmugym.search.policy import Agent
+from fmugym.search.search import VALIDATION, Search
+from fmugym.surrogate.courses import Courses
+from fmugym.surrogate.surrogate import Surrogate
+from fmugym.surrogate.surrogate_fit import fit
+
+__all__ = ["TwinSearch"]
+
+_PROVED: Final = VALIDATION + 2000
+"""The first seed of the episodes in which the FMU is compared with its surrogate."""
+
+_TOLD: Final = VALIDATION + 3000
+_PREDICTED: Final = 32
+"""The first seed of those, and how many, that the surrogate plays for a prediction."""
+
+_EXCITED: Final = 0.4
+"""The part of all steps that excite the FMU,"""
+
+_FEWEST: Final = 4
+"""in at least so many episodes."""
+
+_FEWEST_PLAYED: Final = 6
+"""The steps have so many episodes at least: those that excite, one of the tuned controller and one
+of a policy."""
+
+_DIVIDED: Final = 16
+"""Where they have more than so many, episodes are as long as those of the task."""
+
+_CYCLES: Final = 5
+_FIRST: Final = 120
+_MORE: Final = 40
+"""Rounds of the search until the first proof, and from one proof to the next."""
+
+_CLOSE: Final = 0.2
+"""A prediction is good enough if it is wrong by this part of what is gained."""
+
+_MANY: Final = 256
+"""So many surrogates step together."""
+
+
+class Proof(NamedTuple):
+    """What an agent has reached on the FMU.
+
+    Attributes:
+        agent: The agent.
+        seeds: Those of its episodes.
+        measured: What it has reached there.
+    """
+
+    agent: Agent
+    seeds: Sequence[int]
+    measured: Outcome
+
+
+class Standing(NamedTuple):
+    """How good an agent is, and what the surrogate says of the episodes that it has played."""
+
+    merit: Merit
+    predicted: float
+    measured: float
+
+
+@dataclass
+class TwinSearch:
+    """A search on a surrogate of an FMU, whose result is proved on the FMU.
+
+    The FMU is excited; a surrogate is fitted to what it does; a search plays on the surrogate; and
+    the best agents play on the FMU, from which the next surrogate learns, too. An agent counts as
+    the surrogate says, corrected by what the FMU gives more in the same few episodes.
+
+    Attributes:
+        found: The search.
+        arena: The FMU's; its courses are kept.
+        courses: What the FMU has done.
+        steps: How many steps of the FMU there may be.
+        seconds: The real time that is left.
+        rounds: The largest number of rounds.
+        tell: Gets lines of text.
+        advance: Is told after each round of the seconds since the last one, and of the scores.
+    """
+
+    found: Search
+    arena: Arena
+    courses: Courses
+    steps: float
+    seconds: float
+    rounds: float
+    tell: Callable[[str], None]
+    advance: Callable[[float, str], None]
+    proofs: list[Proof] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._end = monotonic() + self.seconds
+        most, left = self.found.probe.most_steps, self.steps - self.arena.steps
+        self.length = int(min(most, max(left // _DIVIDED, min(most / 2, left // _FEWEST_PLAYED))))
+        self.arena.most_steps = self.length
+
+    def winner(self) -> Agent:
+        """The best agent.
+
+        Raises:
+            ConfigError: If nothing was found.
+        """
+        count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
+        excite(self.arena, self.courses, self.found.probe, count, self.found.rng)
+        for cycle in range(_CYCLES):
+            surrogate = self._fitted()
+            with closing(self._arena_on(surrogate)) as twin:
+                if cycle:
+                    self.found.revalidate(twin)
+                self._search(twin, cycle)
+                self._prove()
+                values = self._values(twin)
+            if not values:
+                raise ConfigError(
+                    f"{self.found.rounds} rounds on a surrogate are too few to find anything: give "
+                    "more --minutes"
+                )
+            self._tell_of(values)
+            best = max(range(len(values)), key=lambda place: values[place].merit)
+            is_over = self._left < 1 or monotonic() > self._end or self.found.rounds >= self.rounds
+            if is_over or _is_close(values, best):
+                break
+        return self.proofs[best].agent
+
+    # The search on the surrogate.
+
+    def _fitted(self) -> Surrogate:
+        found = fit(self.courses)
+        self.tell(
+            f"surrogate of {self.arena.steps} steps: {found.terms.form}; simulations are wrong by "
+            f"{100 * found.error:.2g} % of what outputs vary"
+        )
+        return found
+
+    def _arena_on(self, surrogate: Surrogate) -> Arena:
+        """Where the surrogate plays; limits are those of so many steps."""
+        part = self.length / self.found.probe.most_steps
+        limits = {name: part * one for name, one in self.found.probe.limits.items()}
+        self.arena.limits = limits
+        return Arena(self.arena.make_env, _MANY, self.length, limits, backend=surrogate)
+
+    def _search(self, twin: Arena, cycle: int) -> None:
+        found, left = self.found, self._end - monotonic()
+        until = monotonic() + left / 2
+        last = min(self.rounds, found.rounds + (_MORE if cycle else _FIRST))
+        while found.rounds < last and not found.is_over and monotonic() < until:
+            begin = monotonic()
+            found.advance(twin)
+            self.advance(monotonic() - begin, f"round {found.rounds} on the surrogate")
+
+    # The proof on the FMU.
+
+    @property
+    def _episodes(self) -> int:
+        """How many episodes of the FMU prove an agent."""
+        return (
+            2 if self.length == self.found.probe.most_steps and not self.found.probe.is_same else 1
+        )
+
+    @property
+    def _left(self) -> int:
+        """How many agents may be proved with the steps that are left."""
+        return int((self.steps - self.arena.steps) // (self.length * self._episodes))
+
+    def _prove(self) -> None:
+        """Let the baseline and the best policies play on the FMU."""
+        found = self.found
+        ranked = sorted(found.policies, key=lambda one: one.merit, reverse=True)
+        proved = [one.agent for one in self.proofs]
+        best = [one.best for one in ranked if one.best]
+        agents = [one for one in best[:2] if not any(one is other for other in proved)]
+        base = found.baseline or found.ahead
+        if not self.proofs and base.best:
+            agents.insert(0, base.best)
+        for agent in agents[: self._left]:
+            seeds = range(_PROVED, _PROVED + self._episodes)
+            self.proofs.append(Proof(agent, seeds, agent.play(self.arena, seeds)))
+
+    def _values(self, twin: Arena) -> list[Standing]:
+        """How good the agents are that have played on the FMU."""
+        return [self._value(one, twin) for one in self.proofs]
+
+    def _value(self, proof: Proof, twin: Arena) -> Standing:
+        same = proof.agent.play(twin, proof.seeds)
+        count = 1 if self.found.probe.is_same else _PREDICTED
+        many = proof.agent.play(twin, range(_TOLD, _TOLD + count))
+        corrected = many._replace(
+            returns=many.returns + (proof.measured.returns - same.returns).mean(),
+            costs=many.costs + (proof.measured.costs - same.costs).mean(axis=1, keepdims=True),
+        )
+        measured, predicted = (float(one.returns.mean()) for one in (proof.measured, same))
+        return Standing(corrected.merits[0], predicted, measured)
+
+    def _tell_of(self, values: Sequence[Standing]) -> None:
+        """Tell what the surrogate has predicted, and what the FMU gives."""
+        for proof, value in zip(self.proofs, values, strict=True):
+            self.tell(
+                f"{proof.agent.name}: predicted {value.predicted:.5g}, measured "
+                f"{value.measured:.5g} in {len(proof.seeds)} episodes of {self.length} steps"
+            )
+
+
+def _is_close(values: Sequence[Standing], best: int) -> bool:
+    """Whether the surrogate is close enough to what the FMU gives, beside what is gained."""
+    wrong = abs(values[best].predicted - values[best].measured)
+    return wrong <= _CLOSE * abs(values[best].merit[1] - values[0].merit[1])
