@@ -1,15 +1,11 @@
 """The example two_zones.py: a plant in Python, its task, and three controllers by hand."""
 
-import importlib
 from contextlib import closing
 
 import numpy as np
 import pytest
 
 import fmugym
-
-ROUNDS = 70
-"""The tuning of a table, two looks, and some rounds for each class of policies."""
 
 
 @pytest.fixture(name="zones")
@@ -62,15 +58,3 @@ def test_a_house_at_rest_loses_what_it_gets(zones, tmp_path):
     assert power == pytest.approx(1500.0)
     assert lost == pytest.approx(cop * power + 300 + 3 * 100, rel=1e-4)
     assert 15 < two < one < 30
-
-
-def test_train_beats_the_controllers_by_hand(tmp_path, zones):
-    """The table that it guesses and tunes does, and its agent beats the table."""
-    zones_figures = importlib.import_module("zones_figures")
-    path = zones.make_task(tmp_path)
-    hand = zones_figures.by_hand(path, 30)
-    facts, agent, table = zones_figures.trained(path, tmp_path / "agent", 30, rounds=ROUNDS)
-    assert facts["baseline"] in ("tuned PI", "tuned P")
-    for better, worse in ((table, hand), (agent, table)):
-        mean, half = zones_figures.gain(better, worse)
-        assert mean > half > 0

@@ -11,7 +11,7 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.baselines.arena import Arena
 from fmugym.baselines.parsing import search_of
-from fmugym.search.guessing import Loops, guessed_controllers
+from fmugym.search.guessing import Loops, guessed_controllers, suggested_controllers
 from fmugym.search.pairing import best_pairing, niederlinski_index, relative_gains
 from fmugym.search.step_test import episodes_of, step_test
 
@@ -347,3 +347,18 @@ class TestGuesses:
     def test_what_runs_away_has_none(self, made):
         with pytest.raises(ConfigError, match="bottom, top run away"):
             guessed(column(made, parameters={"feedback": -1.0}))
+
+
+@pytest.mark.parametrize("most", [600, 2000])
+def test_the_two_zones(most, example, tmp_path):
+    """The heat pump controls its tank, each valve its zone; in 7 h or in a day of the winter."""
+    path = example("two_zones").make_task(tmp_path)
+    make = partial(fmugym.load, path, physical=True)
+    with closing(make()) as env:
+        loops = Loops.of(env.task.document, env)
+    with closing(Arena(make)) as arena:
+        guesses = suggested_controllers(arena, loops, most)
+        assert most - 21 < arena.steps <= most
+    assert [*guesses] == ["PI", "P"]
+    expected = {"u_hp": ("T_tank", True), "v1": ("T1", True), "v2": ("T2", True)}
+    assert loops_of(guesses["PI"]) == loops_of(guesses["P"]) == expected
