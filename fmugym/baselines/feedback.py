@@ -41,26 +41,33 @@ class Law(Controller):
     of: str
     setpoint: Signal
     starts: tuple[Numbers, ...]
+    _before: tuple[Any, Any, Sequence[Any]]
 
     @abstractmethod
-    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+    def law(
+        self, value: Any, setpoint: Any, state: Sequence[Any], added: Any = None
+    ) -> tuple[Any, tuple[Any, ...]]:
         """Compute the action, before it is limited: of arrays element by element, or of formulas.
 
         Args:
             value: What is measured.
             setpoint: What it shall be.
             state: What the controller remembers, in the order of ``starts``.
+            added: What is added to the action; None for nothing. See ``Controller.add``.
 
         Returns:
             The action, and what the controller remembers then.
         """
 
     def decision(
-        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+        self,
+        observation: Sequence[Value],
+        memory: Sequence[Value] = (),
+        added: Sequence[Value] | None = None,
     ) -> tuple[Sequence[Value], Sequence[Value]]:
         """See ``Controller.decision``."""
         value, setpoint = (self._formula(observation, one) for one in (self.of, self.setpoint))
-        action, state = self.law(value, setpoint, memory)
+        action, state = self.law(value, setpoint, memory, added and added[0])
         return [action], state
 
     def _prepare(self) -> None:
@@ -75,8 +82,13 @@ class Law(Controller):
     def _decide(self, rows: FloatArray) -> FloatArray:
         action: FloatArray
         value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
-        action, self._state = self.law(value, setpoint, self._state)
+        self._before = value, setpoint, self._state
+        action, self._state = self.law(*self._before)
         return action
+
+    def add(self, added: FloatArray) -> None:
+        """See ``Controller.add``."""
+        _, self._state = self.law(*self._before, added[:, 0])
 
 
 class Hysteresis(Law):
@@ -106,7 +118,9 @@ class Hysteresis(Law):
             self._check_size(name, getattr(self, name))
         super()._prepare()
 
-    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+    def law(
+        self, value: Any, setpoint: Any, state: Sequence[Any], added: Any = None
+    ) -> tuple[Any, tuple[Any, ...]]:
         """See ``Law.law``; the controller remembers its action."""
         error = value - setpoint
         kept = either(error > self.band, self.above, state[0])
@@ -159,7 +173,9 @@ class PID(Law):
             self._check_size(name, getattr(self, name))
         super()._prepare()
 
-    def law(self, value: Any, setpoint: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+    def law(
+        self, value: Any, setpoint: Any, state: Sequence[Any], added: Any = None
+    ) -> tuple[Any, tuple[Any, ...]]:
         """See ``Law.law``; the controller remembers the integral and the last value."""
         integral, last = state
         error = setpoint - value
@@ -169,7 +185,10 @@ class PID(Law):
             return rest, (integral, value)
         growth = self.kp * error * self.time_step / self.ti
         wanted = rest + integral + growth
-        beyond = wanted - limited(wanted, self._low, self._high)
+        inside = limited(wanted, self._low, self._high)
+        beyond = wanted - inside
+        if added is not None:
+            beyond = beyond + (inside + added - limited(inside + added, self._low, self._high))
         integral = either(beyond * growth > 0, integral, integral + growth)
         return rest + integral, (integral, value)
 
@@ -217,7 +236,10 @@ class LQR(Controller):
         self._places = [self._place_of(name) for name in self.of]
 
     def decision(
-        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+        self,
+        observation: Sequence[Value],
+        memory: Sequence[Value] = (),
+        added: Sequence[Value] | None = None,
     ) -> tuple[Sequence[Value], Sequence[Value]]:
         """See ``Controller.decision``."""
         pairs = zip(self._places, self.model.x0, strict=True)

@@ -23,6 +23,7 @@ __all__ = [
     "Policy",
     "Summary",
     "action_of",
+    "controller_named",
     "policy_of",
     "policy_of_controller",
     "simulate",
@@ -145,14 +146,23 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
     Raises:
         ConfigError: If it names no controller, or the controller does not fit the environment.
     """
+    given = controller_named(env, text)
+    if not isinstance(given, str):
+        return action_of(env, str(given))
+    return policy_of_controller(controller_of(given), env)
+
+
+def controller_named(env: FMUEnv, text: str) -> Any:
+    """The controller of a task file by its name: a text or a number; any other text as it is.
+
+    Raises:
+        ConfigError: If the task has controllers, but none of this name.
+    """
     named = _named_controllers(env)
     own = Spellings("controller of the task", named).find(text)
     if own is None and named and text.isidentifier():
         raise unknown_name("controller of the task", text, named)
-    given = text if own is None else named[own]
-    if not isinstance(given, str):
-        return action_of(env, str(given))
-    return policy_of_controller(controller_of(given), env)
+    return text if own is None else named[own]
 
 
 def policy_of_controller(controller: Any, env: FMUEnv) -> Policy:

@@ -14,6 +14,7 @@ from fmugym.export.building import PLATFORMS
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.export.names import new_file
 from fmugym.search.policy import Agent as FoundAgent
+from fmugym.search.residual import Residual
 from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say_result
 from fmugym.tools.targets import maker_of
 from fmugym.training.agents import read_agent
@@ -73,7 +74,7 @@ def _export(arguments: argparse.Namespace) -> None:
         )
     new_file(output)
     model, normalization = read_agent(arguments.agent, arguments.algorithm)
-    is_physical = isinstance(model, FoundAgent)
+    is_physical = isinstance(model, FoundAgent | Residual)
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:
         options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
         agent = agent_of(env, model, normalization, name=output.stem, **options)

@@ -8,12 +8,14 @@ from functools import partial
 
 import numpy as np
 import pytest
+from export_tools import acting, closed_loop, network_for
 from scipy import stats
 from vector_tools import require_same_alone
 
 import fmugym
 from fmugym.declared import Task
 from fmugym.errors import TaskError
+from fmugym.export import agent_of
 from fmugym.vector import FMUVectorEnv
 
 DAY = 86400.0
@@ -152,6 +154,13 @@ class TestPatterns:
         assert "../w*.csv" in text
         assert "../p2024.csv" in text
         assert Task.read(path) == Task.from_dict(task)
+
+    def test_its_files_may_be_listed(self, load_in, folder):
+        task = task_of()
+        task["data"]["T"]["file"] = "w*.csv"
+        found = Task.from_dict(task).with_listed_files()
+        assert found == Task.from_dict(task_of()).with_listed_files()
+        assert found.document["data"]["T"]["file"] == [str(folder / f"w{y}.csv") for y in YEARS]
 
     def test_a_file_of_that_name_is_no_pattern(self, load_in, folder):
         (folder / "w[1].csv").write_text((folder / "w2021.csv").read_text())
@@ -332,6 +341,21 @@ def test_a_rollout_may_assume_other_rows(load_in):
     assert found.observations[..., 1].tolist() == [[7.0] * 3 + [8.0] * 5] * 3
     np.testing.assert_array_equal(found.observations[..., 0], own.observations[..., 0])
     assert len(np.unique(own.observations[:, 0, 0])) > 1
+
+
+def test_an_exported_agent_has_all_files(load_in, folder):
+    """Its parameter chooses one; Python and C look up the same values."""
+    env = load_in(task_of(clock="07-01"))
+    network = network_for(env)
+    agent = agent_of(env, network)
+    assert [one.name for one in agent.logic.parameters] == [NUMBER]
+    for seed in (0, 3):
+        own = folder / str(seed)
+        own.mkdir()
+        _, written, steps = closed_loop(env, acting(network), agent, own, 8, seed)
+        assert (written <= 1e-6, steps) == (True, 8)
+    numbers = {int(env.reset(seed=seed)[1]["drawn"][NUMBER]) for seed in (0, 3)}
+    assert len(numbers) == 2
 
 
 def test_info_lists_files_with_their_numbers(load_in, folder, ran):
