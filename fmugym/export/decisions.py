@@ -101,7 +101,7 @@ def _of_policy(policy: Policy) -> Decision:
         action, now = policy.corrected(observation, memory[:count], base, changes)
         added = policy.added(given)
         if controller is not None and states and added is not None:
-            states = [controller.decision(observation, *memory[count:], added)[1]]
+            states = [controller.decision(observation, memory[count], added)[1]]
         return policy.action_of(action), [*now, *states]
 
     return Decision(network, decide, starts)

@@ -188,7 +188,7 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     if (path / AGENT).exists():
         return Agent.load(path), None
     file = path if path.is_file() else path / _MODEL
-    facts = {"algorithm": algorithm} if path.is_file() else _facts_in(path)
+    facts: dict[str, Any] = {"algorithm": algorithm} if path.is_file() else _facts_in(path)
     kind = algorithm_of(facts["algorithm"])
     with reading(f"the agent in {shown(str(path))} cannot be read"):
         require_regular(file)

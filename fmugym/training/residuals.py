@@ -46,7 +46,7 @@ def residual_facts(
         raise ConfigError(f"--residual-scale is a part of the range, at most 1, got {part:g}")
     make_physical = partial(make_env, physical=True)
     with closing(make_physical()) as env:
-        given = controller_named(env.unwrapped, name)
+        given = controller_named(env, name)
     if plans_ahead(given):
         raise ConfigError(f"{shown(given)} plans ahead; a residual is for a pid or a hysteresis")
     text = given if isinstance(given, str) else f"schedule 00:00={given}"

@@ -90,7 +90,7 @@ class TrainingSettings:
         diary: What to record; None for nothing.
     """
 
-    make_env: Callable[[], FMUEnv]
+    make_env: Callable[..., FMUEnv]
     held_out: Mapping[str, Callable[[], FMUEnv]]
     folder: Path
     algorithm: str = "PPO"
