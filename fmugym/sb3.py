@@ -22,7 +22,6 @@ from fmugym.errors import ConfigError
 from fmugym.extras import lacking
 from fmugym.pool.base import MaskArray
 from fmugym.scaling import scaled_space, unscaled
-from fmugym.search.residual import Residual
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
 from fmugym.vector.infos import observation_of
@@ -298,15 +297,15 @@ class ScaledActions(VecEnvWrapper):
 
 
 class ResidualActions(VecEnvWrapper):
-    """Lets an algorithm add to the actions of a controller; see ``Residual``.
+    """Lets an algorithm add to the actions of a controller.
 
     Args:
         venv: Environments in the physical form of a task, with a Box of observations and a bounded
             Box of actions.
-        residual: The policy, without a model.
+        residual: The ``fmugym.search.residual.Residual``, without a model.
     """
 
-    def __init__(self, venv: VecEnv, residual: Residual) -> None:
+    def __init__(self, venv: VecEnv, residual: Any) -> None:
         self._residual = residual.bind(venv.unwrapped.vector_env)
         if not isinstance(venv.observation_space, spaces.Box):
             raise ConfigError(
@@ -346,7 +345,7 @@ class ResidualActions(VecEnvWrapper):
             self._residual.reset(dones)
         return self._seen(observations), rewards, dones, infos
 
-    def _aside(self) -> Residual:
+    def _aside(self) -> Any:
         """A copy whose decisions leave the controller as it is."""
         other = copy(self._residual)
         other.baseline = copy(other.baseline)
