@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 from itertools import repeat
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from fmugym.checks import check_seed
@@ -31,7 +33,7 @@ try:
 except ImportError as error:
     raise ImportError(lacking("fmugym.sb3", "Stable-Baselines3", "sb3"), name=error.name) from error
 
-__all__ = ["FMUVecEnv", "ScaledActions", "make_sb3_env"]
+__all__ = ["FMUVecEnv", "ResidualActions", "ScaledActions", "make_sb3_env"]
 
 
 Indices = int | Iterable[int] | None
@@ -292,3 +294,59 @@ class ScaledActions(VecEnvWrapper):
     def step_wait(self) -> Any:
         """See ``FMUVecEnv.step_wait``."""
         return self.venv.step_wait()
+
+
+class ResidualActions(VecEnvWrapper):
+    """Lets an algorithm add to the actions of a controller.
+
+    Args:
+        venv: Environments in the physical form of a task, with a Box of observations and a bounded
+            Box of actions.
+        residual: The ``fmugym.search.residual.Residual``, without a model.
+    """
+
+    def __init__(self, venv: VecEnv, residual: Any) -> None:
+        self._residual = residual.bind(venv.unwrapped.vector_env)
+        if not isinstance(venv.observation_space, spaces.Box):
+            raise ConfigError(
+                f"a residual policy needs a Box of observations, got {venv.observation_space}"
+            )
+        width = len(residual.names) + residual.acting
+        seen = spaces.Box(-np.inf, np.inf, (width,), np.float32)
+        super().__init__(venv, seen, scaled_space(venv.action_space))
+        self.memory: dict[str, Any] = {}
+
+    def reset(self) -> Any:
+        """See ``FMUVecEnv.reset``."""
+        observations = self.venv.reset()
+        self._residual.reset()
+        return self._seen(observations)
+
+    def _seen(self, observations: Any) -> npt.NDArray[np.float32]:
+        seen: npt.NDArray[np.float32] = self._residual.seen(observations)
+        self.memory = self._residual.memory  # a checkpoint keeps it
+        return seen
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """See ``FMUVecEnv.step_async``."""
+        self._residual.memory = self.memory
+        self.venv.step_async(self._residual.actions(actions))
+
+    def step_wait(self) -> Any:
+        """See ``FMUVecEnv.step_wait``; the last observations have the controller's actions, too."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        if dones.any():
+            last, ended = observations.copy(), np.flatnonzero(dones).tolist()
+            for index in ended:
+                last[index] = infos[index]["terminal_observation"]
+            seen = self._aside().seen(last)
+            for index in ended:
+                infos[index]["terminal_observation"] = seen[index]
+            self._residual.reset(dones)
+        return self._seen(observations), rewards, dones, infos
+
+    def _aside(self) -> Any:
+        """A copy whose decisions leave the controller as it is."""
+        other = copy(self._residual)
+        other.baseline = copy(other.baseline)
+        return other

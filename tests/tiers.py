@@ -11,6 +11,7 @@ SLOW_MODULES = {
     "test_call_order",
     "test_cli_advice",
     "test_cli_docs",
+    "test_cli_residual",
     "test_cli_search",
     "test_docs_tutorial",
     "test_docs_plant",

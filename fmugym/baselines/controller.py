@@ -145,14 +145,27 @@ class Controller(KnownArguments, ABC):
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         """Forget the episodes of some environments."""
 
+    def add(self, added: FloatArray) -> None:
+        """Tell the controller what is added to its last decision, once that is limited.
+
+        An integral does not grow while the sum is at a limit.
+
+        Args:
+            added: Shape (N, m).
+        """
+
     def decision(
-        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+        self,
+        observation: Sequence[Value],
+        memory: Sequence[Value] = (),
+        added: Sequence[Value] | None = None,
     ) -> tuple[Sequence[Value], Sequence[Value]]:
         """The formulas of a decision, of a controller of one environment.
 
         Args:
             observation: Its elements, as float64.
             memory: The numbers that it remembers.
+            added: What is added to the elements of the action, see ``add``.
 
         Returns:
             The elements of the action, before they are limited, and the numbers that it remembers

@@ -57,7 +57,9 @@ class Hysteresis(Law):
             self._check_size(name, getattr(self, name))
         super()._prepare()
 
-    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+    def law(
+        self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False, added: Any = None
+    ) -> Decided:
         """See ``Law.law``; the controller remembers its action."""
         error = self._value(seen, self.of) - self._value(seen, self.setpoint)
         kept = either(error > self.band, self.above, state[0])
@@ -117,13 +119,19 @@ class PID(Law):
         """See ``Law.integrates``."""
         return self.ti is not None
 
-    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+    def law(
+        self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False, added: Any = None
+    ) -> Decided:
         """See ``Law.law``; the controller remembers the integral and the last value."""
         value, rest, growth = self._parts(seen, state)
         if growth is None:
             return [rest], (state[0], value)
         wanted = rest + state[0] + growth
-        beyond = wanted - limited(wanted, self._low, self._high)
+        inside = limited(wanted, self._low, self._high)
+        beyond = wanted - inside
+        if added is not None:
+            total = inside + added[0]
+            beyond = beyond + (total - limited(total, self._low, self._high))
         stays = beyond * growth > 0
         stays = stays if holds is False else stays | holds
         integral = either(stays, state[0], state[0] + growth)
@@ -186,7 +194,10 @@ class LQR(Controller):
         self._places = [self._place_of(name) for name in self.of]
 
     def decision(
-        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+        self,
+        observation: Sequence[Value],
+        memory: Sequence[Value] = (),
+        added: Sequence[Value] | None = None,
     ) -> tuple[Sequence[Value], Sequence[Value]]:
         """See ``Controller.decision``."""
         pairs = zip(self._places, self.model.x0, strict=True)

@@ -38,7 +38,9 @@ class Constant(Law):
         if not is_element:
             raise ConfigError(f"the action {shown(self.action)} is not in {shown(self.space)}")
 
-    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+    def law(
+        self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False, added: Any = None
+    ) -> Decided:
         """See ``Law.law``."""
         return np.ravel(self.action).astype(np.float64).tolist(), ()
 
@@ -98,7 +100,9 @@ class Schedule(Law):
         self._limits()
         super()._prepare()
 
-    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+    def law(
+        self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False, added: Any = None
+    ) -> Decided:
         """See ``Law.law``; the controller remembers the number of steps."""
         (steps,) = state
         counted = self._start + steps * self.time_step

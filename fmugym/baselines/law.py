@@ -27,16 +27,21 @@ class Law(Controller):
     """
 
     starts: tuple[Numbers, ...] = ()
+    _before: tuple[Sequence[Any], Sequence[Any]]
     signals: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
-    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+    def law(
+        self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False, added: Any = None
+    ) -> Decided:
         """Compute a decision: of arrays element by element, or of formulas.
 
         Args:
             seen: The elements of the observation.
             state: What the controller remembers, in the order of ``starts``.
             holds: Whether an integral must not grow, because nothing would follow it.
+            added: What is added to each element of the action; None for nothing. See
+                ``Controller.add``.
         """
 
     @property
@@ -54,10 +59,13 @@ class Law(Controller):
         return [one for one in given if isinstance(one, str)]
 
     def decision(
-        self, observation: Sequence[Value], memory: Sequence[Value] = ()
+        self,
+        observation: Sequence[Value],
+        memory: Sequence[Value] = (),
+        added: Sequence[Value] | None = None,
     ) -> tuple[Sequence[Value], Sequence[Value]]:
         """See ``Controller.decision``."""
-        elements, state = self.law(observation, memory)
+        elements, state = self.law(observation, memory, added=added)
         return [observation[0].beside(one) for one in elements], state
 
     def _prepare(self) -> None:
@@ -70,6 +78,11 @@ class Law(Controller):
         pairs = zip(self.starts, self._state, strict=True)
         self._state = tuple(np.where(mask, start, now) for start, now in pairs)
 
+    def add(self, added: FloatArray) -> None:
+        """See ``Controller.add``."""
+        _, self._state = self.law(*self._before, added=[*added.T])
+
     def _decide(self, rows: FloatArray) -> FloatArray:
-        elements, self._state = self.law([*rows.T], self._state)
+        self._before = [*rows.T], self._state
+        elements, self._state = self.law(*self._before)
         return np.stack([np.broadcast_to(one, len(rows)) for one in elements], axis=-1)

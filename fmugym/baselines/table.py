@@ -182,15 +182,19 @@ class ControllerTable(Law):
         self._columns = [found[name] for name in names]
         return dict(zip(self._columns, parts, strict=True))
 
-    def law(self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False) -> Decided:
+    def law(
+        self, seen: Sequence[Any], state: Sequence[Any], holds: Any = False, added: Any = None
+    ) -> Decided:
         """See ``Law.law``."""
+        more = {} if added is None else dict(zip(self._columns, added, strict=True))
         states = dict(self._divided(state))
         seen = [*seen]
         self._complete(seen, states)
         decided: dict[str, Any] = {}
         for name in self._order:
             held = self._holds(name, seen, states)
-            (decided[name],), states[name] = self._law(name).law(seen, states[name], held)
+            own = [more[name]] if name in more else None
+            (decided[name],), states[name] = self._law(name).law(seen, states[name], held, own)
             if name in self._places:
                 seen[self._places[name]] = self._limited(name, decided[name])
         remembered = tuple(one for name in self._order for one in states[name])

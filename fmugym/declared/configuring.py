@@ -72,9 +72,9 @@ def beginning_of(naming: Naming) -> dict[str, Any]:
     root, scenarios = declared.root, read_scenarios(declared.root)
     clock, start = root.child("clock"), root.child("start_time")
     length = times_of(naming).get("max_episode_steps", 0) * step
-    if clock.value is None:  # the start time is drawn just before the variables
-        before, period = 0.0, declared.warm_up.period + length
-        return read_begin(start, scenarios, period, before, declared.files)[1]
+    if clock.value is None:
+        span = declared.warm_up.period + length
+        return read_begin(start, scenarios, span, files=declared.files)[1]
     before = naming.warm_steps * step
     begin, files = read_begin(clock, scenarios, length, before, declared.files)
     return {CLOCK: begin, **files}

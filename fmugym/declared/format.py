@@ -477,9 +477,8 @@ DATA: Final = Table(
             Listed(PATH, or_one=True, most=_MOST_FILES),
             "The file, [several, or a pattern](task-file.md#several-files). Commas, semicolons or "
             "tabs separate cells of a CSV file. A file whose name ends with `.parquet` needs the "
-            "extra `parquet`. [Weather](task-file.md#weather) of EnergyPlus and "
-            "[tables of Modelica](task-file.md#tables-of-modelica) are known by "
-            "their first line.",
+            "extra `parquet`. [Weather](task-file.md#weather) of EnergyPlus and [tables of "
+            "Modelica](task-file.md#tables-of-modelica) are known by their first line.",
         ),
         "draw": Key(
             option("shared", "own"),

@@ -234,7 +234,7 @@ class ResolvedTask:
             starts = self._is_on_at_start(variable), _LONG_AGO
             switches |= zip(switch_names(variable), starts, strict=True)
         zeros = dict.fromkeys([*self._worst, *self._updated_kpis], 0.0)
-        beginning = beginning_of(self._naming)
+        beginning = beginning_of(self._naming)  # behind the start time, with which it is drawn
         drawn = beginning | memory if self._declared.files else memory | beginning
         variables = drawn | kept | switches | zeros
         return variables | self._noise(variables)

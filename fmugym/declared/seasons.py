@@ -93,9 +93,9 @@ def read_begin(
     if len(starts) * math.prod(len(files[name]) for name in named) > _MOST_ROWS:
         raise entry.error(f"a season has at most {_MOST_ROWS} beginnings in all files")
     fixed = {name: numbers[0] for name, numbers in files.items() if len(numbers) == 1}
-    free = []
-    for start, *numbers in product(starts, *(files[name] for name in named)):
-        own: dict[str, Any] = fixed | dict(zip(named, numbers, strict=True))
+    free: list[tuple[float, ...]] = []
+    for start, numbers in product(starts, [*product(*(files[name] for name in named))]):
+        own = fixed | dict(zip(named, numbers, strict=True))
         if not any(one.overlaps(start - before, before + length, own) for one in excluded):
             free.append((start, *numbers))
     if not free:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
-from dataclasses import dataclass, field
+from copy import copy, deepcopy
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,6 +19,7 @@ from fmugym.export.policies import network_of_model
 from fmugym.expressions.value import Value
 from fmugym.scaling import are_scaled
 from fmugym.search.policy import LIMIT, Agent, Policy
+from fmugym.search.residual import Residual
 
 __all__ = ["Decision", "decision_of"]
 
@@ -63,7 +64,8 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     """
     model = model.policy() if isinstance(model, Agent) else model
     if isinstance(model, Controller):
-        policy = deepcopy(model) if isinstance(model, Policy) else Policy(deepcopy(model))
+        policy = copy(model) if isinstance(model, Policy) else Policy(model)
+        policy.baseline = deepcopy(policy.baseline)
         return _of_policy(policy.bind(env))
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     if are_scaled(network.space, env.action_space):
@@ -78,13 +80,17 @@ def _of_policy(policy: Policy) -> Decision:
     starts = dict(zip(_MEMORY, past, strict=False))  # without a history there are none
     if isinstance(controller, Law) and controller.starts:
         starts[_CONTROLLER] = np.concatenate([np.ravel(one) for one in controller.starts])
-    network = _network_of(policy)
+    network, chosen = _network_of(policy)
 
     def decide(seen: Sequence[Value], memory: Sequence[Sequence[Value]], ask: _Ask) -> _Decided:
+        given: list[Value] = []
+
         def changes(features: Sequence[Value]) -> Sequence[Value]:
             if network is None:
-                return [seen[0].beside(one) for (one,) in policy._network(np.empty((1, 0)))]
-            return network.chosen(ask(features)) if policy.choices else ask(features)
+                given[:] = [seen[0].beside(one) for (one,) in policy._network(np.empty((1, 0)))]
+            else:
+                given[:] = chosen(ask(features))
+            return given
 
         observation, count = [one.number for one in seen], len(past)
         base: Sequence[Value] = [seen[0].beside(one) for (one,) in policy.middle]
@@ -93,18 +99,30 @@ def _of_policy(policy: Policy) -> Decision:
             base, state = controller.decision(observation, *memory[count:])
             states = [state] if memory[count:] else []
         action, now = policy.corrected(observation, memory[:count], base, changes)
+        added = policy.added(given)
+        if controller is not None and states and added is not None:
+            states = [controller.decision(observation, memory[count], added)[1]]
         return policy.action_of(action), [*now, *states]
 
     return Decision(network, decide, starts)
 
 
-def _network_of(policy: Policy) -> Network | None:
-    """The network; None if there is none, or it sees nothing and so gives constants."""
+def _network_of(policy: Policy) -> tuple[Network | None, _Ask]:
+    """The network, and what its last values mean.
+
+    There is none if nobody corrects the controller, or the network sees nothing and so gives
+    constants.
+    """
+    if isinstance(policy, Residual):
+        unit = network_of_model(policy.model, policy.normalization)
+        network = replace(unit, space=policy.space)
+        return network, lambda values: [one.number for one in unit.chosen(values)]
     if not policy.agent.features:
-        return None
+        return None, lambda values: values
     matrices = [one[0] for one in policy._layers]
     functions = [(Activation("tanh"),)] * (len(matrices) - 1) + [()]
     layers = [Layer(m[:-1].T, m[-1], then) for m, then in zip(matrices, functions, strict=True)]
     mean, divisor = policy.agent.scale
     scaling = Scaling(mean, divisor, np.full(mean.shape, LIMIT))
-    return Network(tuple(layers), policy.space, scaling, dtype=np.dtype(np.float64))
+    network = Network(tuple(layers), policy.space, scaling, dtype=np.dtype(np.float64))
+    return network, network.chosen if policy.choices else lambda values: values

@@ -402,6 +402,13 @@ class Policy(Controller):
         action = self._with_changes(base, network([*observation, *change, *leaky, *told]))
         return action, (observation, leaky, self._told(action))
 
+    def added(self, changes: Sequence[Any]) -> list[Any] | None:
+        """What the network adds to the action and the controller takes notice of.
+
+        A controller that a search corrects takes no notice: None.
+        """
+        return None
+
     def _with_changes(self, base: Sequence[Any], changes: Sequence[Any]) -> list[Any]:
         """The elements of the action, of what the controller and the network say."""
         if self.choices:

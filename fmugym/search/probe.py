@@ -110,9 +110,8 @@ class Probe:
             seeds = range(_EPISODES)
             if seconds < np.inf:
                 arena.play(linear, rows[:_ACTIONS], seeds)
-                steps = int(
-                    min(steps, max(_TRIED, steps * seconds / (most * arena.seconds / arena.steps)))
-                )
+                needed = most * arena.seconds / arena.steps
+                steps = steps if needed <= seconds else max(_TRIED, int(steps * seconds / needed))
             arena.most_steps, arena.seconds, arena.steps, arena.longest = steps, 0.0, 0, 0
             outcome = arena.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
             if arena.steps == outcome.costs[..., -1].sum():

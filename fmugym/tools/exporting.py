@@ -21,6 +21,7 @@ from fmugym.export.names import new_file
 from fmugym.export.surrogates import agent_of_surrogate
 from fmugym.search.excitation import fitted_surrogate
 from fmugym.search.policy import Agent as FoundAgent
+from fmugym.search.residual import Residual
 from fmugym.tools.options import (
     HELP_OF_TASK,
     Commands,
@@ -117,7 +118,7 @@ def _export(arguments: argparse.Namespace) -> None:
     model, normalization = None, None
     if arguments.agent is not None:
         model, normalization = read_agent(arguments.agent, arguments.algorithm)
-    is_physical = model is None or isinstance(model, FoundAgent)
+    is_physical = model is None or isinstance(model, FoundAgent | Residual)
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:
         options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
         if model is None:

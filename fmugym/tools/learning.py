@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from math import isfinite
@@ -13,6 +13,7 @@ from time import monotonic
 from typing import Any, Final
 
 from fmugym.checks import check_number
+from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, table
 from fmugym.episodes.output_files import title_of
 from fmugym.errors import ConfigError
@@ -30,8 +31,10 @@ from fmugym.tools.watching import watched
 from fmugym.training.agents import FACTS
 from fmugym.training.checkpoints import CHECKPOINT
 from fmugym.training.diary import Diary
+from fmugym.training.environments import fitting_envs
 from fmugym.training.hyperparameters import tune
 from fmugym.training.outcome import write_curve, write_outcome
+from fmugym.training.residuals import residual_facts
 from fmugym.training.searching import STATE, Searching
 from fmugym.training.tracking import TRACKERS, tracker_for
 from fmugym.training.training import (
@@ -48,7 +51,7 @@ __all__ = ["add_train"]
 _DEFAULTS: Final[dict[str, Any]] = {
     "algorithm": None,
     "steps": 100_000,
-    "envs": 8,
+    "envs": None,
     "seed": 0,
     "episodes": 5,
     "normalize": True,
@@ -71,7 +74,9 @@ def add_train(commands: Commands) -> None:
         "--rounds", type=int, help="that the search ends with: repeats an earlier one"
     )
     command.add_argument("--steps", type=int, help="of all environments together, at most")
-    command.add_argument("--envs", type=int, help="that step together; default 256, or 8 with PPO")
+    command.add_argument(
+        "--envs", type=int, help="that step together; default 256, or as many as fit with PPO"
+    )
     command.add_argument("--seed", type=int, help="default 0")
     command.add_argument("--episodes", type=int, help="of a test; default 100, 4 of each scenario")
     command.add_argument(
@@ -88,6 +93,15 @@ def _add_of_algorithms(command: argparse.ArgumentParser) -> None:
         "arguments", nargs="*", metavar="KEY=VALUE", help="arguments of the algorithm"
     )
     group.add_argument("--algorithm", help="PPO, A2C, SAC, TD3, DQN ... instead of the search")
+    group.add_argument(
+        "--residual", metavar="NAME", help="add to the action of this controller of the task"
+    )
+    group.add_argument(
+        "--residual-scale",
+        type=float,
+        metavar="PART",
+        help="of the range that is added at most; default 0.3",
+    )
     group.add_argument(
         "--no-normalize",
         action="store_false",
@@ -124,9 +138,11 @@ def _add_of_algorithms(command: argparse.ArgumentParser) -> None:
 
 _OF_ALGORITHMS: Final = (
     *("arguments", "normalize", "tune", "tune_steps", "record", "record_env"),
-    *("record_every", "record_format", "track"),
+    *("record_every", "record_format", "track", "residual", "residual_scale"),
 )
 _OF_SEARCHES: Final = ("minutes", "rounds")
+_SCALE: Final = 0.3
+"""Of the range of actions: what a residual policy adds at most."""
 _OTHERWISE: Final = {"arguments": "KEY=VALUE", "normalize": "--no-normalize"}
 _COUNTS: Final = ("rounds", "steps", "envs", "episodes")
 
@@ -235,10 +251,12 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
     for name, default in _DEFAULTS.items():
         if getattr(arguments, name) is None:
             setattr(arguments, name, before.get(name, default))
-    check_numbers(arguments, "steps", "envs", "episodes")
-    own = arguments_of(arguments.arguments) or before.get("arguments", {})
     names, master = scenarios_of(arguments.task), arguments.master
     make_env = maker_of(arguments.task, master=master)
+    if arguments.envs is None:
+        arguments.envs = fitting_envs(make_env)
+    check_numbers(arguments, "steps", "envs", "episodes")
+    own = arguments_of(arguments.arguments) or before.get("arguments", {})
     held_out = {name: maker_of(arguments.task, name, master) for name in names}
     return TrainingSettings(
         make_env,
@@ -251,8 +269,21 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
         arguments.episodes,
         normalize=arguments.normalize,
         arguments=own,
+        residual=_residual_of(arguments, make_env, before.get("residual")),
         diary=_diary_of(arguments, before.get("record")),
     )
+
+
+def _residual_of(
+    arguments: argparse.Namespace, make_env: Callable[..., FMUEnv], before: Any
+) -> Any:
+    """What the options say of a controller; without any, what the training was begun with."""
+    if arguments.residual is None:
+        if arguments.residual_scale is not None:
+            raise ConfigError("name the controller, too: --residual NAME")
+        return before
+    scale = _SCALE if arguments.residual_scale is None else arguments.residual_scale
+    return residual_facts(make_env, arguments.residual, scale, tell)
 
 
 def _diary_of(arguments: argparse.Namespace, before: Any) -> Diary | None:

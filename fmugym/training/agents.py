@@ -24,6 +24,8 @@ from fmugym.extras import imported
 from fmugym.files import replaced_together
 from fmugym.scaling import are_scaled, unscaled
 from fmugym.search.policy import AGENT, Agent, require_task
+from fmugym.search.residual import Residual
+from fmugym.training.residuals import residual_of
 
 __all__ = [
     "FACTS",
@@ -92,8 +94,9 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
     which can run code. Those of a search hold numbers only.
 
     Returns:
-        The agent, which ``bind`` prepares for an environment: that of a search for one or many
-        environments in the physical form of the task, one of Stable-Baselines3 for a single one.
+        The agent, which ``bind`` prepares for an environment: that of a search and a residual
+        policy for one or many environments in the physical form of the task, any other one of
+        Stable-Baselines3 for a single one.
         It refuses other observations or actions than it was trained for.
 
     Raises:
@@ -103,6 +106,8 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
     model, normalization = read_agent(path)
     if isinstance(model, Agent):
         return model.policy()
+    if isinstance(model, Residual):
+        return model
     return TrainedModel(path, model, normalization, {} if path.is_file() else _facts_in(path))
 
 
@@ -165,7 +170,7 @@ class TrainedModel:
 
 
 def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
-    """Load an agent of a search, or the model of one of Stable-Baselines3.
+    """Load an agent of a search, a residual policy, or a model of Stable-Baselines3.
 
     Only load the latter from sources that you trust: their files hold pickles, which can run code.
 
@@ -174,8 +179,8 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
         algorithm: The name of the algorithm of a file; a folder knows its own.
 
     Returns:
-        The agent or model, and its ``VecNormalize``, or None. That of a file is
-        ``normalization.pkl`` beside it, if there is one.
+        The agent or model, and its ``VecNormalize``, or None; a residual policy has its own. That
+        of a file is ``normalization.pkl`` beside it, if there is one.
 
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
@@ -183,10 +188,15 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     if (path / AGENT).exists():
         return Agent.load(path), None
     file = path if path.is_file() else path / _MODEL
-    kind = algorithm_of(algorithm if path.is_file() else _facts_in(path)["algorithm"])
+    facts: dict[str, Any] = {"algorithm": algorithm} if path.is_file() else _facts_in(path)
+    kind = algorithm_of(facts["algorithm"])
     with reading(f"the agent in {shown(str(path))} cannot be read"):
         require_regular(file)
-        return kind.load(file, device="cpu"), _normalization_in(file.parent)
+        model, normalization = kind.load(file, device="cpu"), _normalization_in(file.parent)
+        if facts.get("residual") is None:
+            return model, normalization
+        task = facts["observations"], facts["space"]
+        return residual_of(facts["residual"], model, normalization, task), None
 
 
 def _facts_in(folder: Path) -> dict[str, Any]:

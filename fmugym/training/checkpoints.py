@@ -34,6 +34,7 @@ CHECKPOINT: Final = "checkpoint.json"
 NOTHING_TO_RESUME: Final = "has no training to resume"
 _OF_NORMALIZATION: Final = ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward")
 _OF_MONITOR: Final = ("episode_returns", "episode_lengths", "episode_count")
+_OF_RESIDUAL: Final = ("memory",)
 
 
 def save_checkpoint(folder: Path, model: Any, venv: Any, more: dict[str, Any]) -> None:
@@ -86,7 +87,7 @@ def _layers(venv: Any) -> list[Any]:
 
 
 def _wrappers(venv: Any) -> list[dict[str, Any]]:
-    names = (*_OF_NORMALIZATION, *_OF_MONITOR)
+    names = (*_OF_NORMALIZATION, *_OF_MONITOR, *_OF_RESIDUAL)
     return [
         {name: vars(layer)[name] for name in names if name in vars(layer)}
         for layer in _layers(venv)[:-1]

@@ -20,6 +20,7 @@ from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reading, reason, shown
 from fmugym.files import replaced_together
+from fmugym.pool.processors import available_processors
 from fmugym.search.guessing import MOST_TESTED
 from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
@@ -29,6 +30,7 @@ from fmugym.surrogate.courses import Courses
 from fmugym.training.agents import FACTS
 from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
+from fmugym.training.environments import VERY_SLOW
 from fmugym.training.training import require_new
 from fmugym.training.twin import TwinSearch
 
@@ -47,8 +49,8 @@ _TESTED: Final = 4
 
 _SLOW: Final = 3e-4
 _GROUP: Final = 8
-"""If a step takes longer than this in seconds, so many environments step together: more would
-hardly be faster, and take long to open."""
+"""If a step takes longer than this in seconds, so many environments step together at most: more
+would hardly be faster, and take long to open."""
 
 _LONGEST: Final = 2**31
 """Steps of a scenario, which has a length of its own."""
@@ -181,7 +183,9 @@ class Searching:
         return found
 
     def _arena_of(self, make_env: Callable[[], Any], most_steps: int) -> Arena:
-        group = self.envs if self._probe.seconds < _SLOW else min(self.envs, _GROUP)
+        seconds, group = self._probe.seconds, self.envs
+        if seconds > _SLOW:
+            group = min(group, _GROUP if seconds < VERY_SLOW else available_processors())
         return Arena(make_env, group, most_steps, self._probe.limits)
 
     def _tell_the_plan(self, is_resumed: bool) -> None:

@@ -27,7 +27,7 @@ from fmugym.episodes.evaluation import (
     warning_of_one_reward,
 )
 from fmugym.episodes.progress_bars import Advance, no_progress
-from fmugym.episodes.simulation import Player
+from fmugym.episodes.simulation import Player, policy_of_controller
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.files import write_whole
 from fmugym.scaling import can_be_scaled
@@ -48,6 +48,7 @@ from fmugym.training.checkpoints import (
     save_checkpoint,
 )
 from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, note
+from fmugym.training.residuals import begin_at_zero, residual_of
 from fmugym.training.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
 
@@ -85,10 +86,11 @@ class TrainingSettings:
         normalize: Whether observations and rewards are normalized by running statistics. Actions
             with other ranges are scaled to -1 to 1 in any case.
         arguments: Arguments of the algorithm.
+        residual: Which controller's action it adds to, see ``residual_facts``; None for none.
         diary: What to record; None for nothing.
     """
 
-    make_env: Callable[[], FMUEnv]
+    make_env: Callable[..., FMUEnv]
     held_out: Mapping[str, Callable[[], FMUEnv]]
     folder: Path
     algorithm: str = "PPO"
@@ -99,6 +101,7 @@ class TrainingSettings:
     most_steps: int = 10_000
     normalize: bool = True
     arguments: Mapping[str, Any] | None = None
+    residual: Mapping[str, Any] | None = None
     diary: Diary | None = None
 
     def facts(self) -> dict[str, Any]:
@@ -110,7 +113,13 @@ class TrainingSettings:
             "episodes": self.episodes,
             "normalize": self.normalize,
             "arguments": dict(self.arguments or {}),
+            "residual": self.residual,
         }
+
+    @property
+    def make_trained(self) -> Callable[[], FMUEnv]:
+        """Makes the environment of the training; a controller needs its physical form."""
+        return self.make_env if self.residual is None else partial(self.make_env, physical=True)
 
 
 def arguments_of(texts: Iterable[str]) -> dict[str, Any]:
@@ -183,9 +192,11 @@ def train(
         with closing(settings.make_env()) as env:
             require_units(env.unwrapped)
     wrap = _recorder(settings, resume)
-    venv = sb3.make_sb3_env(settings.make_env, settings.num_envs, seed=settings.seed, wrap=wrap)
+    venv = sb3.make_sb3_env(settings.make_trained, settings.num_envs, seed=settings.seed, wrap=wrap)
     try:
-        if can_be_scaled(venv.action_space):
+        if settings.residual is not None:
+            venv = sb3.ResidualActions(venv, residual_of(settings.residual))
+        elif can_be_scaled(venv.action_space):
             venv = sb3.ScaledActions(venv)
         if settings.normalize:
             venv = _normalized(venv)
@@ -304,6 +315,8 @@ class _Training:
             self._load()
         else:
             self._model = _new_model(settings, venv)
+            if settings.residual is not None:
+                begin_at_zero(self._model)
             self._require_an_update()
             self._tell_of_the_plan()
             settings.folder.mkdir(parents=True, exist_ok=True)
@@ -333,6 +346,8 @@ class _Training:
     def run(self) -> None:
         """Train until the end, and evaluate once more."""
         self._log_to()
+        if self._is_new and self._settings.residual is not None:
+            self.evaluate()  # the controller itself, which later agents have to beat
         remaining = self._settings.steps - self._steps
         remaining -= remaining % _steps_between_updates(self._model, self._settings.num_envs)
         try:
@@ -425,8 +440,7 @@ class _Training:
         if steps == self._progress["last"]:
             return
         is_first = self._progress["last"] < 0
-        make_policy = partial(policy_with, self._model, self._normalization())
-        scores = self._scores(Player(make_policy, is_physical=False), self._wrap)
+        scores = self._scores(self._player(), self._wrap)
         mean = sum(score.mean for score in scores) / len(scores)
         self._progress |= {"last": steps, "updates": self._model._n_updates}
         self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")
@@ -438,6 +452,14 @@ class _Training:
             self._progress["best"] = mean
             self._keep(reward=mean)
         self._watch.evaluated(steps, mean)
+
+    def _player(self) -> Player:
+        """The one who acts as the agent does now."""
+        if self._settings.residual is None:
+            make_policy = partial(policy_with, self._model, self._normalization())
+            return Player(make_policy, is_physical=False)
+        residual = residual_of(self._settings.residual, self._model, self._normalization())
+        return Player(partial(policy_of_controller, residual), is_physical=True)
 
     def scores_of_kept(self) -> list[Score]:
         """Let the agent in the folder play the episodes of the evaluations once more."""
@@ -475,8 +497,10 @@ class _Training:
 
     def _keep(self, **more: float) -> None:
         (env,) = self._venv.get_attr("unwrapped", 0)
-        names = names_of(env)
-        facts = {"algorithm": self._settings.algorithm, "steps": self._steps, **names, **more}
+        residual = self._settings.residual
+        own = {} if residual is None else {"residual": residual, "space": str(env.action_space)}
+        about = {**names_of(env), **own, **more}
+        facts = {"algorithm": self._settings.algorithm, "steps": self._steps, **about}
         save(self._settings.folder, self._model, self._normalization(), facts)
 
 

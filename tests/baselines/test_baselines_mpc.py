@@ -263,7 +263,7 @@ class TestFuture:
 
     def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
         daily = lookup(86400.0, [0.0, 43200.0, 86400.0], [1.0, 5.0, 1.0])
-        assert daily.mean([(0.0, 1e6)]) == 3.0
+        assert daily.mean([(0.0, 1e6, {})]) == 3.0
 
 
 class TestModel:

@@ -1,13 +1,20 @@
 """How the native pool's work is divided among helper threads: shown by counters, not by times."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from process_tools import run_python
 from test_native_pool import NativePool, busy_fmu, make, on_linux
 
-from fmugym.pool.processors import available_processors, processor_quota
+from fmugym.pool.processors import (
+    available_memory,
+    available_processors,
+    processor_quota,
+    used_memory,
+)
 
 COUNT = """
 import json, sys, time
@@ -171,6 +178,49 @@ class TestQuota:
     def test_of_control_groups(self, tmp_path, monkeypatch, files, expected):
         monkeypatch.setattr("fmugym.pool.processors._ROOT", self.write(tmp_path, files))
         assert processor_quota() == expected
+
+    @pytest.mark.parametrize(
+        ("files", "expected"),
+        [
+            ({}, np.inf),
+            ({"proc/meminfo": "MemTotal:  9 kB\nMemAvailable:     4 kB\n"}, 4096.0),
+            (
+                {
+                    "proc/meminfo": "MemAvailable:     4 kB\n",
+                    "proc/self/cgroup": "0::/a/b\n",
+                    "sys/fs/cgroup/a/memory.max": "1000\n",
+                    "sys/fs/cgroup/a/memory.current": "300\n",
+                    "sys/fs/cgroup/a/b/memory.max": "max\n",
+                    "sys/fs/cgroup/a/b/memory.current": "300\n",
+                },
+                700.0,
+            ),
+            (
+                {
+                    "proc/self/cgroup": "5:cpu:/\n6:memory:/x\n",
+                    "sys/fs/cgroup/memory/memory.limit_in_bytes": "100",
+                    "sys/fs/cgroup/memory/memory.usage_in_bytes": "130",
+                },
+                0.0,
+            ),
+        ],
+    )
+    def test_memory(self, tmp_path, monkeypatch, files, expected):
+        monkeypatch.setattr("fmugym.pool.processors._ROOT", self.write(tmp_path, files))
+        assert available_memory() == expected
+
+    @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+    def test_used_memory_counts_processes_that_were_started(self):
+        size = 50 * 2**20
+        code = f"import sys; a = b'x' * {size}; print(); sys.stdin.read()"
+        before = used_memory()
+        with subprocess.Popen(
+            [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        ) as child:
+            child.stdout.readline()
+            during = used_memory()
+            child.communicate()
+        assert size < during - before < 3 * size
 
     @pytest.mark.parametrize(("quota", "expected"), [(np.inf, 8), (3.0, 3), (1.5, 2), (0.1, 1)])
     def test_counts_as_processors_do(self, monkeypatch, quota, expected):
