@@ -91,6 +91,7 @@ class Arena:
         longest: The steps of the longest episode until now.
         infos: Those of the last step.
         advance: Is told of each step, as a part of all that ``play`` has to do.
+        backend: What steps in the place of the FMU; see ``FMUVectorEnv``.
     """
 
     make_env: Callable[[], Any]
@@ -103,6 +104,7 @@ class Arena:
     ceiling: float = np.inf
     infos: Any = None
     advance: Callable[[float], None] = lambda part: None
+    backend: Any = "auto"
     _envs: FMUVectorEnv | None = None
 
     def close(self) -> None:
@@ -154,7 +156,7 @@ class Arena:
         size = min(jobs, self.most_envs)
         if self._envs is None or self._envs.num_envs < size:
             self.close()
-            self._envs = FMUVectorEnv(self.make_env, size)
+            self._envs = FMUVectorEnv(self.make_env, size, backend=self.backend)
         return self._envs
 
     def _play(

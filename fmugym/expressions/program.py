@@ -24,6 +24,7 @@ __all__ = [
     "TYPES",
     "Program",
     "UncompilableError",
+    "engine",
     "evaluate",
     "is_function",
     "letter_of",
@@ -89,7 +90,7 @@ def require_same_table(native: Any) -> None:
 
 
 @functools.cache
-def _engine() -> Any:
+def engine() -> Any:
     """The C extension, which must have been built from the same sources as this module."""
     require_engine("a program")
     from fmugym import _native
@@ -221,6 +222,6 @@ def evaluate(
     first, second = (np.ascontiguousarray(part).reshape(-1) for part in actions)
     elements = first.size // count
     parts = program.with_rows(find)
-    if _engine().evaluate(parts, count, elements, first, second, results, seen):
+    if engine().evaluate(parts, count, elements, first, second, results, seen):
         raise IndexError("a hook looks up an index outside of its table")
     return list(results)

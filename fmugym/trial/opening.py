@@ -56,6 +56,11 @@ def make_pool(
         LicenceError: If the FMU gets no licence within ``spec.licence_wait``.
         FMULoadError: If the FMU cannot be loaded or instantiated, or the backend is not available.
     """
+    maker = getattr(wishes.get("backend"), "make_pool", None)
+    if maker is not None:
+        task: dict[str, Any] = {"starts": starts, "length": length, "spare": spare}
+        own: Pool = maker(fmu, spec, num_instances, log, **task, **wishes)
+        return own
     wished = Wishes(**wishes)
     pool = pool_of_backend(fmu, spec, num_instances, log, wished)
     if pool is not None:

@@ -1,0 +1,1 @@
+"""Surrogates: what an FMU has done, as a program of expressions that steps in its place."""

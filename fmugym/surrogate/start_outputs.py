@@ -1,0 +1,60 @@
+"""The outputs with which episodes begin, from what is set before initialization."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from fmugym.archive.variable import Variable
+from fmugym.pool.base import FloatArray
+from fmugym.surrogate.courses import Course
+
+__all__ = ["Start"]
+
+_PENALTY: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Start:
+    """The outputs at the start of an episode, as a sum of terms of what is set before.
+
+    Attributes:
+        names: The variables that are set.
+        mean, deviation: What their values are like, shape (p,).
+        low, high: The range of the outputs, shape (k,).
+        weights: Those of the terms, shape (k, f).
+    """
+
+    names: tuple[str, ...]
+    mean: FloatArray
+    deviation: FloatArray
+    low: FloatArray
+    high: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, variables: Sequence[Variable], courses: Sequence[Course]) -> Start:
+        """The fit to the starts of courses."""
+        given = np.array([one.starts for one in courses])
+        first = np.array([one.outputs[0] for one in courses])
+        deviation = given.std(axis=0)
+        names = tuple(one.name for one in variables)
+        known = names, given.mean(axis=0), deviation, first.min(axis=0), first.max(axis=0)
+        terms = cls(*known, np.zeros(0))._terms(given.T)
+        square = terms @ terms.T / len(given) + _PENALTY * np.eye(len(terms))
+        return cls(*known, np.linalg.solve(square, terms @ first / len(given)).T)
+
+    def _terms(self, given: FloatArray) -> FloatArray:
+        """Shape (f, n): 1, the scaled values that differ, and their products."""
+        differ = self.deviation > 0.0
+        scaled = ((given.T - self.mean) / np.where(differ, self.deviation, 1.0)).T[differ]
+        first, second = np.triu_indices(len(scaled))
+        ones = np.ones((1, given.shape[1]))
+        return np.concatenate([ones, scaled, scaled[first] * scaled[second]])
+
+    def outputs(self, given: FloatArray) -> FloatArray:
+        """The outputs, shape (k, n), from values of shape (p, n)."""
+        return np.clip((self.weights @ self._terms(given)).T, self.low, self.high).T

@@ -1,0 +1,231 @@
+"""The fit of a surrogate to the courses of an FMU."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from operator import itemgetter
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.errors import ConfigError
+from fmugym.pool.base import FloatArray
+from fmugym.surrogate.courses import Course, Courses
+from fmugym.surrogate.start_outputs import Start
+from fmugym.surrogate.surrogate import Surrogate
+from fmugym.surrogate.terms import Form, Terms, rows_of
+
+__all__ = ["fit"]
+
+_FOLDS: Final = 3
+_PENALTIES: Final = (1e-8, 1e-6, 1e-4, 1e-2)
+_HORIZON: Final = 48
+"""The steps of a simulation, at most; a quarter of the longest course is enough."""
+
+_TIE: Final = 0.95
+"""A larger model must have less than this part of the error of a smaller one."""
+
+_LAGS: Final = 4
+_TANHS: Final = 60
+_GRID: Final = 15
+_BEYOND: Final = 0.2
+"""Outputs stay in their range in the courses, which is so much wider on both sides."""
+
+_FEW: Final = 5
+"""An output may be limited if it is so often at an end of its range, after a step."""
+
+
+def fit(courses: Courses) -> Surrogate:
+    """Fit a surrogate.
+
+    Forms compete by the errors of simulations of courses that the fit has not seen. They begin with
+    the linear one; what lessens the error most is added until nothing does.
+
+    Raises:
+        ConfigError: If there are no steps.
+    """
+    data = _Data(courses)
+    best, form = data.trial(data.linear), data.linear
+    while True:
+        found = [(*data.trial(one), one) for one in data.extensions(form)]
+        if not found:
+            break
+        error, penalty, larger = min(found, key=itemgetter(0))
+        if not error < _TIE * best[0]:
+            break
+        best, form = (error, penalty), larger
+    return data.fitted(form, *best)
+
+
+class _Data:
+    """The courses, and which of them each fold leaves out."""
+
+    def __init__(self, courses: Courses) -> None:
+        spec = courses.spec
+        self.all = [one for one in courses.all() if one.steps]
+        if not self.all or spec is None:
+            raise ConfigError("a surrogate needs courses with steps")
+        self.courses = courses
+        self.widths = len(spec.outputs), len(spec.inputs)
+        angles = [i for i, one in enumerate(spec.outputs) if one.unit == "rad"]
+        self.linear = Form(angles=tuple(angles))
+        changes = np.concatenate([np.diff(one.outputs, axis=0) for one in self.all])
+        size = changes.std(axis=0)
+        self.size = np.where(size > 0.0, size, 1.0)
+        everything = np.concatenate([one.outputs for one in self.all])
+        self.spread = np.where(np.ptp(everything, axis=0) > 0.0, everything.std(axis=0), 1.0)
+        self.spread[angles] = 1.0
+        self.ends = everything.min(axis=0), everything.max(axis=0)
+        after = np.concatenate([one.outputs[1:] for one in self.all])
+        self.at_an_end = (after == self.ends[0]) | (after == self.ends[1])
+        self.horizon = max(1, min(_HORIZON, max(one.steps for one in self.all) // 4))
+
+    def bounds(self, form: Form) -> tuple[FloatArray, FloatArray]:
+        """Between what outputs stay: near their ranges, or exactly where these limit them."""
+        low, high = self.ends
+        beyond = _BEYOND * (high - low)
+        beyond[[*form.limited]], beyond[[*form.angles]] = 0.0, np.inf
+        return low - beyond, high + beyond
+
+    def extensions(self, form: Form) -> Iterator[Form]:
+        """The forms that have one thing more."""
+        if form.lags < _LAGS:
+            yield replace(form, lags=form.lags + 1)
+        if not form.quadratic:
+            yield replace(form, quadratic=True)
+        if not form.tanhs:
+            yield replace(form, tanhs=_TANHS)
+        if not form.starts and len({one.starts.tobytes() for one in self.all}) > 2 * _FOLDS:
+            yield replace(form, starts=True)
+        for place in np.flatnonzero(self.at_an_end.sum(axis=0) >= _FEW).tolist():
+            if place not in (*form.limited, *form.angles):
+                yield replace(form, limited=(*form.limited, place))
+        if len(form.thresholds) < self.widths[1]:
+            found = self._threshold(form)
+            if found is not None:
+                yield form.with_threshold(*found)
+
+    # The fit of one form.
+
+    def _matrices(self, form: Form, courses: Sequence[Course]) -> tuple[FloatArray, FloatArray]:
+        rows = np.concatenate([rows_of(form, one) for one in courses], axis=1)
+        changes = np.concatenate([np.diff(one.outputs, axis=0) for one in courses])
+        return rows, changes / self.size
+
+    def _weights(
+        self, form: Form, courses: Sequence[Course], penalties: Sequence[float]
+    ) -> tuple[Terms, list[FloatArray]]:
+        """The terms, and for each penalty the weights, shape (f, k)."""
+        rows, changes = self._matrices(form, courses)
+        terms = Terms.of(form, rows, self.widths)
+        values = terms.values(rows)
+        found = np.zeros((len(penalties), len(values), len(self.size)))
+        for place, change in enumerate(changes.T):
+            after = (rows[place] + change * self.size[place])[None]
+            low, high = self.ends[0][place], self.ends[1][place]
+            counts = (low < after) & (after < high) if place in form.limited else np.ones((1, 1))
+            square, right = (values * counts) @ values.T, (values * counts) @ change
+            for number, penalty in enumerate(penalties):
+                ridge = penalty * rows.shape[1] * np.eye(len(square))
+                ridge[0, 0] *= 1e-6  # the constant
+                found[number, :, place] = np.linalg.solve(square + ridge, right) * self.size[place]
+        return terms, [*found]
+
+    def trial(self, form: Form) -> tuple[float, float]:
+        """The smallest mean error of simulations, and the penalty that has it."""
+        errors = np.array([self._fold(form, number) for number in range(_FOLDS)])
+        mean = np.nan_to_num(errors, nan=np.inf).mean(axis=0)
+        return float(mean.min()), _PENALTIES[int(mean.argmin())]
+
+    def _fold(self, form: Form, number: int) -> FloatArray:
+        """The error of each penalty in the courses of one fold."""
+        kept, left = self._split(number)
+        terms, weights = self._weights(form, kept, _PENALTIES)
+        return simulation_errors(terms, weights, left, self.horizon, self)
+
+    def _split(self, number: int) -> tuple[list[Course], list[Course]]:
+        """The courses of a fit, and those that it does not see."""
+        long = [one for one in self.all if one.steps >= self.horizon] or self.all
+        pieces = self.all if len(long) >= 2 * _FOLDS else list(_pieces(self.all, 2 * self.horizon))
+        left = [one for place, one in enumerate(pieces) if place % _FOLDS == number]
+        kept = [one for place, one in enumerate(pieces) if place % _FOLDS != number]
+        return kept or pieces, left or pieces
+
+    def _threshold(self, form: Form) -> tuple[int, float] | None:
+        """The threshold of an input that explains most of a step, beside linear terms."""
+        small = replace(form, tanhs=0, quadratic=False)
+        rows, changes = self._matrices(small, self.all)
+        terms = Terms.of(small, rows, self.widths)
+        values = terms.values(rows)
+        linear = values[: 1 + terms.factor_count]
+        best = np.inf, 0, 0.0
+        for place in range(self.widths[1]):
+            own = rows[terms.first_input + place]
+            if len(np.unique(own)) < 3 or any(place == one for one, _ in form.thresholds):
+                continue
+            low, high = float(own.min()), float(own.max())
+            for _ in range(3):
+                grid = np.linspace(low, high, _GRID + 2)
+                left = [_left(values, linear * (own > one), changes) for one in grid[1:-1]]
+                least = int(np.argmin(left))
+                best = min(best, (left[least], place, float(grid[least + 1])))
+                low, high = float(grid[least]), float(grid[least + 2])
+        return None if best[0] == np.inf else best[1:]
+
+    def fitted(self, form: Form, error: float, penalty: float) -> Surrogate:
+        """The surrogate of a form, fitted to all courses."""
+        terms, (weights,) = self._weights(form, self.all, [penalty])
+        start = Start.of(self.courses.variables, self.courses.all())
+        return Surrogate(terms, weights.T, *self.bounds(form), start, error)
+
+
+def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:
+    """What terms leave of the changes, shape (n, k)."""
+    both = np.concatenate([values, more])
+    square = both @ both.T + 1e-6 * both.shape[1] * np.eye(len(both))
+    weights = np.linalg.solve(square, both @ changes)
+    return float(np.square(changes - both.T @ weights).mean())
+
+
+def _pieces(courses: Sequence[Course], steps: int) -> Iterator[Course]:
+    """Parts of courses of so many steps."""
+    for starts, inputs, outputs in courses:
+        for begin in range(0, len(inputs), steps):
+            yield Course(starts, inputs[begin : begin + steps], outputs[begin : begin + steps + 1])
+
+
+def simulation_errors(
+    terms: Terms, weights: Sequence[FloatArray], courses: Sequence[Course], horizon: int, data: Any
+) -> FloatArray:
+    """The root mean square error of outputs in simulations, for each set of weights.
+
+    Simulations begin everywhere in the courses, and last so many steps. Errors count beside the
+    spread of the output.
+    """
+    horizon = min(horizon, max(one.steps for one in courses))
+    windows = [
+        (rows_of(terms.form, one)[:, begin : begin + horizon], one.outputs[begin + 1 :][:horizon])
+        for one in courses
+        for begin in range(0, one.steps - horizon + 1, max(1, horizon // 2))
+    ]
+    rows = np.stack([rows for rows, _ in windows], axis=1)  # d, windows, steps
+    true = np.stack([outputs for _, outputs in windows], axis=1)  # steps, windows, k
+    outputs, count = data.widths[0], len(weights)
+    now = np.tile(rows[:, :, 0], count)
+    errors, first = np.zeros((count, outputs)), terms.first_input
+    low, high = data.bounds(terms.form)
+    for step in range(horizon):
+        now[first:] = np.tile(rows[first:, :, step], count)
+        parts = np.split(terms.values(now), count, axis=1)
+        change = np.concatenate(
+            [w.T @ part for w, part in zip(weights, parts, strict=True)], axis=1
+        )
+        after = np.clip(now[:outputs] + change, low[:, None], high[:, None])
+        if terms.form.lags:
+            now[2 * outputs : first] = now[outputs : first - outputs].copy()
+            now[outputs : 2 * outputs] = after - now[:outputs]
+        now[:outputs] = after
+        wrong = (after - np.tile(true[step].T, count)) / data.spread[:, None]
+        errors += np.square(wrong).reshape(outputs, count, -1).mean(axis=2).T
+    return np.asarray(np.sqrt(errors.mean(axis=1) / horizon))

@@ -1,0 +1,202 @@
+"""The forms of surrogates: of what the change of outputs in a step is a sum."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.expressions.graph import Graph
+from fmugym.expressions.value import Value, where
+from fmugym.pool.base import FloatArray
+from fmugym.surrogate.courses import Course
+
+__all__ = ["Form", "Terms", "rows_of"]
+
+_BEYOND: Final = 0.2
+"""Numbers are clipped to their range in the courses, which is so much wider on both sides."""
+
+_STEEPNESS: Final = 1.5
+"""The root mean square of what is in a tanh."""
+
+Number = Callable[[float], Any]
+
+
+@dataclass(frozen=True)
+class Form:
+    """What the change of an output depends on.
+
+    Attributes:
+        lags: How many earlier outputs and inputs it depends on, beside the present ones.
+        angles: The outputs of which it sees sine and cosine in their place.
+        thresholds: Inputs and their values; beyond these, other numbers hold.
+        quadratic: Whether all products of two count.
+        tanhs: How many functions tanh of random sums there are.
+        starts: Whether it depends on what is set before initialization.
+        limited: The outputs that an end of their range in the courses limits.
+    """
+
+    lags: int = 0
+    angles: tuple[int, ...] = ()
+    thresholds: tuple[tuple[int, float], ...] = ()
+    quadratic: bool = False
+    tanhs: int = 0
+    starts: bool = False
+    limited: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        words = ["quadratic" if self.quadratic else "linear"]
+        words += [f"{self.lags} lags"] * bool(self.lags)
+        words += [f"threshold {value:.4g}" for _, value in self.thresholds]
+        words += [f"{self.tanhs} tanh"] * bool(self.tanhs)
+        words += ["parameters"] * self.starts
+        words += [f"{len(self.limited)} limited"] * bool(self.limited)
+        return ", ".join(words)
+
+    def with_threshold(self, place: int, value: float) -> Form:
+        """The form with another threshold of an input."""
+        return replace(self, thresholds=(*self.thresholds, (place, value)))
+
+
+def rows_of(form: Form, course: Course) -> FloatArray:
+    """What the steps of a course depend on, shape (d, T).
+
+    These are the outputs, their changes in earlier steps, the inputs, their changes, and the
+    values set before initialization. Before an episode, nothing has changed.
+    """
+    parts = [course.outputs[:-1].T]
+    parts += [_changes(course.outputs[:-1].T, lag) for lag in range(form.lags)]
+    parts += [course.inputs.T]
+    parts += [_changes(course.inputs.T, lag) for lag in range(form.lags)]
+    if form.starts:
+        parts.append(np.repeat(course.starts[:, None], course.steps, axis=1))
+    return np.concatenate(parts)
+
+
+def _changes(values: FloatArray, lag: int) -> FloatArray:
+    """The changes so many steps ago, shape (k, T)."""
+    changes = np.diff(values, axis=1, prepend=values[:, :1])
+    return np.concatenate([np.zeros((len(values), lag)), changes], axis=1)[:, : values.shape[1]]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The terms of a form. They are products of one or two factors, and 1.
+
+    Attributes:
+        form: The form.
+        widths: How many outputs and inputs there are.
+        mean, deviation, low, high: Those of what steps depend on, shape (d,).
+        mixing: The weights in each tanh, and a constant, shape (tanhs, factors + 1).
+        pairs: The factors of each product, shape (2, q).
+    """
+
+    form: Form
+    widths: tuple[int, int]
+    mean: FloatArray
+    deviation: FloatArray
+    low: FloatArray
+    high: FloatArray
+    mixing: FloatArray = field(init=False)
+    pairs: Any = field(init=False)
+
+    @classmethod
+    def of(cls, form: Form, rows: FloatArray, widths: tuple[int, int]) -> Terms:
+        """The terms, scaled by rows as ``rows_of`` gives them."""
+        low, high = rows.min(axis=1), rows.max(axis=1)
+        beyond = _BEYOND * (high - low)
+        deviation = rows.std(axis=1)
+        return cls(form, widths, rows.mean(axis=1), deviation, low - beyond, high + beyond)
+
+    def __post_init__(self) -> None:
+        graph = Graph()
+        plain = len(self._scaled([Value.read(graph, "x", i) for i in range(len(self.mean))]))
+        rng = np.random.default_rng(plain)
+        mixing = rng.standard_normal((self.form.tanhs, plain + 1))
+        mixing *= _STEEPNESS / np.sqrt(plain + 1)
+        flags = plain + self.form.tanhs
+        places = [(i, j) for i in range(plain) for j in range(i, plain) if self.form.quadratic]
+        for number in range(len(self.form.thresholds)):
+            places += [(flags + number, j) for j in range(plain)]
+        object.__setattr__(self, "mixing", mixing)
+        object.__setattr__(self, "pairs", np.array(places, int).reshape(-1, 2).T)
+
+    @property
+    def first_input(self) -> int:
+        """The place of the first input in a row."""
+        return self.widths[0] * (1 + self.form.lags)
+
+    @property
+    def count(self) -> int:
+        """How many terms there are."""
+        return 1 + self.factor_count + int(self.pairs.shape[1])
+
+    @property
+    def factor_count(self) -> int:
+        """How many factors there are."""
+        return self.mixing.shape[1] - 1 + len(self.mixing) + len(self.form.thresholds)
+
+    def _scaled(self, row: Sequence[Value], number: Number = float) -> list[Value]:
+        """The factors that are scaled numbers; what is constant in the courses is none."""
+        outputs = self.widths[0]
+        found: list[Value] = []
+        for place, value in enumerate(row):
+            if place < outputs and place in self.form.angles:
+                found += [np.sin(value), np.cos(value)]  # type: ignore[list-item]
+            elif self.deviation[place] > 0.0:
+                low, high, mean = map(number, (self.low[place], self.high[place], self.mean[place]))
+                inside: Any = np.minimum(np.maximum(value, low), high)
+                found.append((inside - mean) * number(1.0 / self.deviation[place]))
+        return found
+
+    def factors(self, row: Sequence[Value], number: Number = float) -> list[Value]:
+        """All factors, of what a step depends on.
+
+        Args:
+            row: Its values.
+            number: Makes an operand of a number, of which a program may have too many.
+        """
+        scaled = self._scaled(row, number)
+        found = [*scaled]
+        for *weights, constant in self.mixing.tolist():
+            total = row[0].beside(number(constant))
+            for weight, value in zip(weights, scaled, strict=True):
+                total = total + value * number(weight)
+            found.append(np.tanh(total))  # type: ignore[arg-type]
+        return found + [
+            where(row[self.first_input + place] > value, 1.0, 0.0)
+            for place, value in self.form.thresholds
+        ]
+
+    def values(self, rows: FloatArray) -> FloatArray:
+        """The terms of rows, by numpy: shape (f, n) from (d, n)."""
+        outputs, first = self.widths[0], self.first_input
+        angles = [place for place in range(outputs) if place in self.form.angles]
+        plain = [place for place, scale in enumerate(self.deviation) if scale > 0.0]
+        parts = {place: np.stack([np.sin(rows[place]), np.cos(rows[place])]) for place in angles}
+        plain = [place for place in plain if place not in parts]
+        inside = np.clip(rows[plain].T, self.low[plain], self.high[plain])
+        scaled = ((inside - self.mean[plain]) * (1.0 / self.deviation[plain])).T
+        parts |= dict(zip(plain, scaled[:, None], strict=True))
+        factors = np.concatenate([parts[place] for place in sorted(parts)])
+        sums = self.mixing[:, :-1] @ factors + self.mixing[:, -1:]
+        flags = [rows[first + place] > value for place, value in self.form.thresholds]
+        factors = np.concatenate([factors, np.tanh(sums), np.reshape(flags, (-1, rows.shape[1]))])
+        one, two = self.pairs
+        return np.concatenate([np.ones((1, rows.shape[1])), factors, factors[one] * factors[two]])
+
+    def total(self, factors: Sequence[Value], weights: Sequence[Any]) -> Value:
+        """The sum of the terms, each with its weight."""
+        first, *others = weights
+        products = [*factors, *(factors[i] * factors[j] for i, j in self.pairs.T.tolist())]
+        total = factors[0].beside(first)
+        for weight, one in zip(others, products, strict=True):
+            total = total + weight * one
+        return total
+
+
+def rows_in(graph: Graph, name: str, count: int) -> list[Value]:
+    """Values that a program reads in so many rows."""
+    return [Value.read(graph, name, place) for place in range(count)]

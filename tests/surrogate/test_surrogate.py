@@ -1,0 +1,216 @@
+"""Surrogates: recorded courses, the fit, the programs, and the pool that they step."""
+
+from contextlib import closing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fmugym import FMUVectorEnv
+from fmugym.archive.variable import Variable
+from fmugym.envs import HouseEnv, PendulumEnv
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.surrogate.courses import Course, Courses
+from fmugym.surrogate.start_outputs import Start
+from fmugym.surrogate.surrogate import Surrogate
+from fmugym.surrogate.surrogate_fit import fit
+from fmugym.surrogate.terms import Form, Terms, rows_of
+
+
+class Given(Courses):
+    """Courses that were computed, of outputs y and inputs u."""
+
+    def __init__(self, outputs, inputs, courses):
+        super().__init__()
+        names = [f"y{i}" for i in range(outputs)], [f"u{i}" for i in range(inputs)]
+        made = [
+            [Variable(n, "Real", 0, "local", "continuous", "exact") for n in one] for one in names
+        ]
+        self.spec = SimpleNamespace(outputs=made[0], inputs=made[1])
+        self.variables = (Variable("y_0", "Real", 0, "parameter", "fixed", "exact"),)
+        self._given = courses
+
+    def all(self):
+        return self._given
+
+
+def played(step, state, inputs, seen=slice(None)):
+    """The course of a difference equation."""
+    states = [np.array(state, float)]
+    for row in inputs:
+        states.append(step(states[-1], row))
+    return Course(states[0][:1], np.array(inputs), np.array(states)[:, seen])
+
+
+def courses_of(step, width, outputs, inputs, seen=slice(None), count=8, steps=120):
+    rng = np.random.default_rng(0)
+    given = []
+    for _ in range(count):
+        held = np.repeat(rng.uniform(0, 1, (steps // 6, inputs)), 6, axis=0)
+        given.append(played(step, rng.uniform(-1, 1, width), held, seen))
+    return Given(outputs, inputs, given)
+
+
+def simulated(surrogate, course):
+    """The outputs of a surrogate on the inputs of a course, by the definition of its rows."""
+    now = Course(course.starts, course.inputs[:0], course.outputs[:1])
+    for place in range(course.steps):
+        both = np.concatenate([now.outputs, now.outputs[-1:]])
+        row = rows_of(surrogate.terms.form, Course(now.starts, course.inputs[: place + 1], both))
+        change = surrogate.weights @ surrogate.terms.values(row[:, -1:])[:, 0]
+        after = np.clip(now.outputs[-1] + change, surrogate.low, surrogate.high)
+        now = Course(now.starts, course.inputs[: place + 1], np.vstack([now.outputs, after]))
+    return now.outputs
+
+
+def linear(state, action):
+    return np.array([[0.9, 0.1], [-0.1, 0.8]]) @ state + np.array([0.1, 0.2]) * action
+
+
+def dead_band(state, action):
+    return 0.9 * state + np.where(action > 0.3, action, 0.0)
+
+
+def hidden(state, action):
+    """The second state is not seen."""
+    return np.array([0.8 * state[0] + 0.2 * state[1], 0.95 * state[1] + 0.3 * action[0]])
+
+
+def limited(state, action):
+    return np.clip(state + action - 0.45, -1.0, 1.0)
+
+
+class TestFit:
+    @pytest.mark.parametrize(
+        ("step", "width", "outputs", "form"),
+        [
+            (linear, 2, 2, Form()),
+            (hidden, 2, 1, Form(lags=1)),
+            (limited, 1, 1, Form(limited=(0,))),
+        ],
+    )
+    def test_the_form_is_that_of_the_equation(self, step, width, outputs, form):
+        found = fit(courses_of(step, width, outputs, 1, slice(outputs)))
+        assert found.terms.form == form
+        unseen = courses_of(step, width, outputs, 1, slice(outputs), count=20, steps=60).all()[-1]
+        assert simulated(found, unseen)[1:] == pytest.approx(unseen.outputs[1:], abs=0.02)
+
+    def test_a_dead_band_is_found(self):
+        found = fit(courses_of(dead_band, 1, 1, 1))
+        ((place, value),) = found.terms.form.thresholds
+        assert (place, value) == (0, pytest.approx(0.3, abs=0.02))
+
+    def test_there_must_be_steps(self):
+        with pytest.raises(ConfigError, match="steps"):
+            fit(Courses())
+
+
+class TestPrograms:
+    @pytest.mark.parametrize(
+        "form",
+        [
+            Form(),
+            Form(lags=2, quadratic=True),
+            Form(lags=4, tanhs=60, quadratic=True),
+            Form(angles=(1,), tanhs=5, thresholds=((0, 0.4), (1, 0.7))),
+            Form(starts=True, limited=(0,), lags=1, thresholds=((1, 0.5),), quadratic=True),
+        ],
+    )
+    def test_programs_are_what_numpy_computes(self, form):
+        rng = np.random.default_rng(1)
+        given = Course(rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2)))
+        rows = rows_of(form, given)
+        terms = Terms.of(form, rows, (2, 2))
+        rows = np.ascontiguousarray(1.5 * rows)  # some of them are outside of the range
+        weights = rng.normal(size=(2, terms.count))
+        low, high = np.array([-1.0, -2.0]), np.array([1.0, 2.0])
+        start = Start.of((), [given])
+        surrogate = Surrogate(terms, weights, low, high, start, 0.0)
+        after = np.zeros((2, 40))
+        surrogate.runs(rows, after)()
+        expected = np.clip(rows[:2].T + terms.values(rows).T @ weights.T, low, high)
+        assert np.allclose(after.T, expected, rtol=0, atol=1e-12)
+
+
+def test_courses_are_what_the_fmu_does():
+    courses = Courses()
+    made = FMUVectorEnv(PendulumEnv, 3, backend=courses), FMUVectorEnv(PendulumEnv, 3)
+    with closing(made[0]) as envs, closing(made[1]) as own:
+        for one in (envs, own):
+            one.reset(seed=5)
+        expected = [own.inside.pool.outputs.copy()]
+        torques = np.random.default_rng(0).uniform(-2, 2, (7, 3, 1)).astype(np.float32)
+        for action in torques:
+            assert np.array_equal(envs.step(action)[0], own.step(action)[0])
+            expected.append(own.inside.pool.outputs.copy())
+    assert courses.steps == 21
+    for place, course in enumerate(courses.all()):
+        assert np.array_equal(course.outputs, np.array(expected)[:, :, place])
+        assert course.inputs[:, 0] == pytest.approx(torques[:, place, 0], rel=1e-6)
+        assert [one.name for one in courses.variables][:2] == ["theta_0", "theta_dot_0"]
+        assert course.starts[0] == pytest.approx(course.outputs[0, 0])
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A surrogate of the pendulum."""
+    courses, rng = Courses(), np.random.default_rng(0)
+    with closing(FMUVectorEnv(PendulumEnv, 8, backend=courses)) as envs:
+        envs.reset(seed=0)
+        for _ in range(25):
+            action = rng.uniform(-2, 2, (8, 1)).astype(np.float32)
+            for _ in range(4):
+                envs.step(action)
+    return fit(courses)
+
+
+class TestPool:
+    def test_an_environment_steps_it_in_the_place_of_the_fmu(self, pendulum):
+        """Observations and rewards are those of the FMU for a while."""
+        with (
+            closing(FMUVectorEnv(PendulumEnv, 4, backend=pendulum)) as twin,
+            closing(FMUVectorEnv(PendulumEnv, 4)) as envs,
+        ):
+            for seed in (3, 100):
+                seen = [one.reset(seed=seed)[0] for one in (twin, envs)]
+                assert seen[0] == pytest.approx(seen[1], abs=0.02)
+                for step in range(20):
+                    action = np.full((4, 1), 2 * np.sin(step / 3), np.float32)
+                    results = [one.step(action) for one in (twin, envs)]
+                    for part in range(2):
+                        assert results[0][part] == pytest.approx(results[1][part], abs=0.1)
+
+    def test_environments_that_rest_stay_as_they_are(self, pendulum):
+        with closing(FMUVectorEnv(PendulumEnv, 3, backend=pendulum)) as envs:
+            before, _ = envs.reset(seed=0)
+            pool = envs.inside.pool
+            kept = pool.outputs[:, 1].copy()
+            envs.step_around(np.ones((3, 1), np.float32), np.array([False, True, False]))
+            assert np.array_equal(pool.outputs[:, 1], kept)
+            assert not np.array_equal(pool.outputs[:, 0], before[0])
+            assert pool.health()["steps"].tolist() == [1, 0, 1]
+
+    def test_other_variables_cannot_be_read(self, pendulum):
+        with closing(FMUVectorEnv(PendulumEnv, 1, backend=pendulum)) as envs:
+            envs.reset(seed=0)
+            variable = Variable("m", "Real", 0, "parameter", "fixed", "exact")
+            with pytest.raises(SimulationError, match="'m'"):
+                envs.inside.pool.read((variable,))
+
+    def test_lags_begin_anew_with_each_episode(self):
+        """Of a house, which has a threshold and a hidden state."""
+        courses, rng = Courses(), np.random.default_rng(0)
+        with closing(FMUVectorEnv(HouseEnv, 4, backend=courses)) as envs:
+            envs.reset(seed=0)
+            for _ in range(60):
+                action = rng.uniform(0, 1, (4, 1)).astype(np.float32)
+                for _ in range(3):
+                    envs.step(action)
+        found = fit(courses)
+        assert found.terms.form.lags > 0
+        with closing(FMUVectorEnv(HouseEnv, 2, backend=found)) as twin:
+            rows = []
+            for _ in range(2):
+                twin.reset(seed=7)
+                rows.append([twin.step(np.full((2, 1), 0.6, np.float32))[0] for _ in range(30)])
+        assert np.array_equal(*rows)
