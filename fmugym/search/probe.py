@@ -30,11 +30,14 @@ _STEPS: Final = 100
 """So many constant actions play so many episodes, until their ends or for so many steps."""
 
 _QUICK: Final = 2e-3
+_TRIED: Final = 2
+"""Steps that tell how long all others would take."""
+
 _TIMED: Final = 25
 """If a step takes less than this in seconds, as many candidates as in a round tell its time by so
 many steps: the overhead of a call is for all of them."""
 
-MOST_PROBED: Final = _EPISODES * (_ACTIONS * _STEPS + FEW * _TIMED)
+MOST_PROBED: Final = _EPISODES * (_ACTIONS * (_TRIED + _STEPS) + FEW * _TIMED)
 """The steps of a probe, at most. As many count, since how many there are depends on the time."""
 
 
@@ -72,6 +75,9 @@ class Probe:
         envs: int,
         tell: Callable[[str], None],
         most_tested: int = MOST_TESTED,
+        most: int = MOST_PROBED,
+        backend: Any = "auto",
+        seconds: float = np.inf,
     ) -> Probe:
         """Take some steps with constant actions.
 
@@ -80,6 +86,9 @@ class Probe:
             envs: The largest number of environments.
             tell: Gets lines about what a user would not expect.
             most_tested: The most steps of the test by which controllers are guessed.
+            most: The largest number of all other steps.
+            backend: See ``FMUVectorEnv``.
+            seconds: How long the steps may take.
 
         Raises:
             ConfigError: If no policy can be searched for the task, or its first step always fails.
@@ -96,18 +105,25 @@ class Probe:
         constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
-        with closing(Arena(make_env, envs, _STEPS)) as arena:
+        steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
+        with closing(Arena(make_env, envs, _TRIED, backend=backend)) as arena:
             seeds = range(_EPISODES)
+            if seconds < np.inf:
+                arena.play(linear, rows[:_ACTIONS], seeds)
+                steps = int(
+                    min(steps, max(_TRIED, steps * seconds / (most * arena.seconds / arena.steps)))
+                )
+            arena.most_steps, arena.seconds, arena.steps, arena.longest = steps, 0.0, 0, 0
             outcome = arena.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
             if arena.steps == outcome.costs[..., -1].sum():
                 raise ConfigError(
                     f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
                     "'fmugym validate' tells more"
                 )
-            if arena.seconds < _QUICK * arena.steps:
+            if most == MOST_PROBED and steps == _STEPS and arena.seconds < _QUICK * arena.steps:
                 arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
                 arena.play(linear, rows, seeds)
-            seconds, longest = arena.seconds / arena.steps, arena.longest
+            took, longest = arena.seconds / arena.steps, arena.longest
             agents = agents or list(_guessed(arena, loops, tell, most_tested))
         seen = np.dstack([outcome.returns, outcome.moments])
         if np.ptp(outcome.returns) == 0:
@@ -125,9 +141,9 @@ class Probe:
             limits,
             most_steps,
             is_same=not np.ptp(seen, axis=1).any(),
-            seconds=seconds,
-            usual_steps=longest if longest < _STEPS else most_steps,
-            steps=MOST_PROBED + (0 if loops is None else steps_of_test(loops, most_tested)),
+            seconds=took,
+            usual_steps=longest if longest < steps else most_steps,
+            steps=most + (0 if loops is None else steps_of_test(loops, most_tested)),
         )
 
     def round_time(self, episodes: int) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import Entrant
+from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
@@ -208,6 +208,13 @@ class Search:
     def _seeds(self, first: int, count: int = _VALIDATED) -> range:
         """Seeds of a validation; one is enough if all episodes are the same."""
         return range(first, first + (1 if self.probe.is_same else count))
+
+    def revalidate(self, arena: Arena) -> None:
+        """Go on in another environment: merits become those that the agents have there."""
+        for one in (*self.controllers, *self.policies):
+            one.lead, one.starts, one.gained = NO_MERIT, 0, one.rounds
+            if one.best:
+                one.merit = one.best.play(arena, self._seeds(VALIDATION)).merits[0]
 
     # Who takes part.
 

@@ -189,7 +189,8 @@ def _search(arguments: argparse.Namespace) -> None:
             {name: one["mean_costs"]["failed episodes"] for name, one in facts["test"].items()}
         )
         options = f"; --rounds {facts['rounds']} repeats the search"
-        tell(f"{arguments.output} has the agent{options if facts['rounds'] else ''}")
+        is_repeated = facts["rounds"] and "surrogate" not in facts
+        tell(f"{arguments.output} has the agent{options if is_repeated else ''}")
 
 
 def _tell_faults(parts: Mapping[str, float]) -> None:

@@ -25,10 +25,12 @@ from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
 from fmugym.search.search_file import bytes_of, plain_of, search_in
+from fmugym.surrogate.courses import Courses
 from fmugym.training.agents import FACTS
 from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
 from fmugym.training.training import require_new
+from fmugym.training.twin import TwinSearch
 
 __all__ = ["STATE", "Searching"]
 
@@ -52,6 +54,18 @@ _LONGEST: Final = 2**31
 """Steps of a scenario, which has a length of its own."""
 
 _EPISODES: Final = 100
+_LEAST: Final = 200
+_OF_PROBE: Final = 20
+"""The probe takes one step, and one second, of so many."""
+
+_OF_TEST: Final = 6
+_FEWEST_TESTED: Final = 4
+"""A test of an agent that was searched on a surrogate takes this part of the time of the search,
+or so many episodes."""
+
+_MOST_OF_FMU: Final = 20_000
+"""A surrogate hardly gains from more steps of the FMU."""
+
 _OF_SCENARIO: Final = 4
 """Episodes of a test, and of each scenario if the task has some."""
 
@@ -118,12 +132,14 @@ class Searching:
         """
         self._begin = monotonic()
         self._seconds_of: dict[str, float] = {}
+        self._courses = Courses()
         self._found = self._resumed() if resume else self._begun()
         self._probe, self._before = self._found.probe, self._found.steps
-        self._tell_the_plan()
+        self._tell_the_plan(resume)
         try:
             with closing(self._arena_of(self.make_env, self._probe.most_steps)) as self._arena:
                 self._arena.steps = self._before
+                self._arena.backend = self._courses if self._on_surrogate else "auto"
                 winner = self._winner()
             return self._judged(winner)
         finally:
@@ -132,12 +148,13 @@ class Searching:
 
     def _begun(self) -> Search:
         require_new(self.folder)
-        if self.steps <= MOST_PROBED:
-            raise ConfigError(
-                f"{self.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
-            )
-        tested = int(min(MOST_TESTED, (self.steps - MOST_PROBED) / _TESTED))
-        probe = Probe.of(self.make_env, self.envs, self.tell, tested)
+        if self.steps < _LEAST:
+            raise ConfigError(f"{self.steps} steps are too few: give {_LEAST} or more")
+        most = int(min(MOST_PROBED, self.steps // _OF_PROBE))
+        tested = int(min(MOST_TESTED, (self.steps - most) / _TESTED))
+        backend = "auto" if most == MOST_PROBED else self._courses
+        seconds = self.seconds / _OF_PROBE
+        probe = Probe.of(self.make_env, self.envs, self.tell, tested, most, backend, seconds)
         agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
         self.tell(f"to be beaten: {', '.join(dict.fromkeys(agents))}")
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -165,12 +182,21 @@ class Searching:
         group = self.envs if self._probe.seconds < _SLOW else min(self.envs, _GROUP)
         return Arena(make_env, group, most_steps, self._probe.limits)
 
-    def _tell_the_plan(self) -> None:
+    def _tell_the_plan(self, is_resumed: bool) -> None:
         """Tell what will be done, and how long."""
         probe = self._probe
         took = probe.round_time(self._found.episodes)
         left = self.seconds - (monotonic() - self._begin)
         self._is_enough = took * _FEWEST <= left
+        too_long = FEW * self._found.episodes * probe.usual_steps * _FEWEST > self.steps
+        self._on_surrogate = not is_resumed and (too_long or not self._is_enough)
+        self._on_surrogate = self._on_surrogate and self._is_fmu()
+        if self._on_surrogate:
+            self.tell(
+                f"there are not {_FEWEST} rounds of {FEW} candidates with episodes of "
+                f"{probe.usual_steps} steps: the search plays on a surrogate of the FMU"
+            )
+            return
         if took * _ENOUGH > left:
             who = "policies may hardly gain" if self._is_enough else "only the baseline is tuned"
             self.tell(
@@ -189,6 +215,11 @@ class Searching:
             + " and ".join(text for text in limits if str(np.inf) not in text)
         )
 
+    def _is_fmu(self) -> bool:
+        """Whether an FMU steps, and nothing in its place."""
+        with closing(self.make_env()) as env:
+            return env.inside.opening.backend is None
+
     def _winner(self) -> Agent:
         """Search, and find the winner of the last validation.
 
@@ -198,6 +229,8 @@ class Searching:
             ConfigError: If nothing was found.
             CeilingError: If no round has had enough steps.
         """
+        if self._on_surrogate:
+            return self._proved()
         try:
             self._go_on()
         finally:
@@ -211,6 +244,24 @@ class Searching:
                 f"{self._found.rounds} rounds are too few to find anything: give more --minutes, "
                 "--rounds or --steps"
             )
+        self._save(winner)
+        return winner
+
+    def _proved(self) -> Agent:
+        """Search on a surrogate of the FMU, and find the agent that is best on the FMU."""
+        left = self.seconds - (monotonic() - self._begin)
+        limited = self.minutes is None and self.steps < np.inf
+        steps = min(self.steps, _MOST_OF_FMU, left / 2 / self._probe.seconds)
+        twin = TwinSearch(
+            self._found,
+            self._arena,
+            self._courses,
+            self.steps if limited else steps,
+            np.inf if limited else left,
+            self.tell,
+            self.advance,
+        )
+        winner = twin.winner()
         self._save(winner)
         return winner
 
@@ -276,12 +327,14 @@ class Searching:
             "rounds": found.rounds,
             "seed": found.seed,
             "steps": found.steps,
+            **({"surrogate": True} if self._on_surrogate else {}),
             **more,
         }
         named = replace(agent, names=task["observations"], actions=task["actions"])
         with replaced_together() as beside:
             beside(self.folder / AGENT).write_bytes(named.content())
-            beside(self.folder / STATE).write_bytes(bytes_of(found))
+            if not self._on_surrogate:  # whose search cannot be resumed
+                beside(self.folder / STATE).write_bytes(bytes_of(found))
             beside(self.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
         return facts
 
@@ -297,6 +350,9 @@ class Searching:
         }
         usual = _EPISODES if len(arenas) < 2 else _OF_SCENARIO
         count = 1 if probe.is_same else self.episodes or usual
+        if self._on_surrogate and self.episodes is None and self.minutes:
+            most = self.seconds / _OF_TEST / probe.seconds / probe.most_steps / len(arenas)
+            count = min(count, max(_FEWEST_TESTED, int(most)))
         agents = {winner.name: winner}
         planners = self._planners(baseline.text, count * len(arenas))
         others = (one.best for one in found.controllers)
