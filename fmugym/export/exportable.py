@@ -16,7 +16,7 @@ from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
 from fmugym.search.policy import Agent as FoundAgent
 
-__all__ = ["Agent", "agent_of"]
+__all__ = ["Agent", "agent_of", "check_name"]
 
 
 _TAKEN: Final = frozenset(
@@ -38,6 +38,7 @@ class Agent:
         network: The network; None for none.
         notes: Lines that tell a reader what it is.
         units: The units of the plant by name.
+        is_plant: Whether it stands for the plant, so that the first sample is that of the start.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Agent:
     network: Network | None
     notes: tuple[str, ...]
     units: Mapping[str, Unit]
+    is_plant: bool = False
 
     @property
     def version(self) -> str:
@@ -78,13 +80,23 @@ def agent_of(
     Raises:
         ConfigError: If the policy or the task cannot be exported; the text names what cannot.
     """
+    check_name(name)
+    decision = decision_of(env, model, normalization)
+    logic = logic_of(env, decision, all_inputs=all_inputs, external=external)
+    return Agent(name, logic, decision.network, _notes(env, model), env.fmu.description.units)
+
+
+def check_name(name: str) -> str:
+    """Check what functions and files are called by, and return it.
+
+    Raises:
+        ConfigError: If it has more than letters, digits and _, or is that of another file.
+    """
     if not check_text("name", name).isidentifier() or not name.isascii():
         raise ConfigError(f"the name must have letters, digits and _ only, got {shown(name)}")
     if name in _TAKEN:
         raise ConfigError(f"the name {name!r} is that of a file of C; choose another one")
-    decision = decision_of(env, model, normalization)
-    logic = logic_of(env, decision, all_inputs=all_inputs, external=external)
-    return Agent(name, logic, decision.network, _notes(env, model), env.fmu.description.units)
+    return name
 
 
 def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:

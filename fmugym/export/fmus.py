@@ -114,6 +114,7 @@ def _model(agent: Agent, ports: Sequence[Port], token: str) -> str:
 #define AGENT_INIT {name}_init
 #define AGENT_STEP {name}_step
 #define SAMPLE_TIME {name.upper()}_SAMPLE_TIME
+#define IS_PLANT {"true" if agent.is_plant else "false"}
 #define MEASUREMENTS {len(logic.measurements)}u
 #define ACTIONS {len(logic.inputs)}u
 

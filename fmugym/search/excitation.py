@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import closing
 from typing import Any, Final, Self
 
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.controller import Controller
+from fmugym.baselines.arena import Arena
+from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.parsing import has_range, search_of
 from fmugym.search.flattening import choices_of
+from fmugym.search.policy import Agent, Policy
+from fmugym.search.probe import Probe
+from fmugym.surrogate.courses import Courses
+from fmugym.surrogate.surrogate import Surrogate
+from fmugym.surrogate.surrogate_fit import fit
 
-__all__ = ["Excitation"]
+__all__ = ["Excitation", "excite", "fitted_surrogate"]
 
 _RANDOM: Final = 0.4
 """The part of segments with an action at random,"""
@@ -24,8 +33,98 @@ _AT_AN_END: Final = 0.3
 _SHIFT: Final = 0.3
 """The largest shift, as a part of the range."""
 
+_SEEDS: Final = 500_000
+"""Seeds are smaller than those of validations."""
+
 _LONGEST: Final = 16
 """The steps of a segment are between 1 and so many, short ones as often as long ones."""
+
+
+_STARTS: Final = 32
+"""Starts of episodes without a step, which tell how episodes begin."""
+
+_GROUP: Final = 8
+_OF_PROBE: Final = 20
+"""The look at a task takes one step of so many."""
+
+_OF_TEST: Final = 4
+"""The test by which controllers are guessed takes one step of so many, at most."""
+
+_EPISODES: Final = 8
+"""Steps are divided among so many episodes, or more if these are shorter."""
+
+
+def fitted_surrogate(make_env: Callable[[], Any], steps: int, seed: int = 0) -> Surrogate:
+    """Excite an FMU, and fit a surrogate to what it does.
+
+    Args:
+        make_env: Makes the environment, in the physical form of its task.
+        steps: The steps of the FMU, at most.
+        seed: Of episodes and actions.
+
+    Raises:
+        ConfigError: If no policy can be searched for the task, or its first step always fails.
+    """
+    courses, rng = Courses(), np.random.default_rng(seed)
+    most = max(_GROUP, steps // _OF_PROBE)
+    probe = Probe.of(
+        make_env,
+        _GROUP,
+        lambda line: None,
+        most_tested=steps // _OF_TEST,
+        most=most,
+        backend=courses,
+    )
+    length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
+    with closing(Arena(make_env, _GROUP, length, backend=courses)) as arena:
+        excite(arena, courses, probe, (steps - courses.steps) // length, rng)
+    return fit(courses)
+
+
+def excite(
+    arena: Arena, courses: Courses, probe: Probe, count: int, rng: np.random.Generator
+) -> None:
+    """Play episodes with the untuned controllers of a task, whose actions are disturbed.
+
+    Args:
+        arena: Its episodes are no longer than they shall be; its backend are the courses.
+        courses: Keep what the FMU does.
+        probe: What is known of the task.
+        count: How many episodes there are.
+        rng: Draws episodes and actions.
+    """
+    seeds = [0] * count if probe.is_same else rng.integers(_SEEDS, size=count).tolist()
+    for place, agent in enumerate(probe.agents):
+        own = seeds[place :: len(probe.agents)]
+        if own:
+            made = _excitations(agent, int(rng.integers(_SEEDS)))
+            arena.play(made, np.zeros((1, 1)), own)
+    envs = arena.open(1)
+    for _ in range(-(-_STARTS // envs.num_envs)):
+        before = courses.steps
+        envs.reset(seed=rng.integers(_SEEDS, size=envs.num_envs).tolist())
+        if probe.is_same or courses.steps > before:  # warm-ups take steps, too
+            return
+
+
+def _excitations(agent: Agent, seed: int) -> Callable[[FloatArray], Any]:
+    """A function that makes the excitations of one group of episodes after another."""
+    first = 0
+
+    def made(rows: FloatArray) -> Excitation:
+        nonlocal first
+        begin, first = first, first + len(rows)
+        return Excitation(_untuned(agent), seed, begin)
+
+    return made
+
+
+def _untuned(agent: Agent) -> Policy:
+    """An agent whose numbers are in the middle of their ranges."""
+    if has_range(agent.text):
+        middle = np.full(len(search_of(agent.text).ranges), 0.5)
+        return agent.with_numbers(middle).policy()
+    return agent.policy() if agent.is_found else Policy(None)
 
 
 class Excitation:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from fmugym.archive.variable import Variable
+from fmugym.expressions.value import Value
 from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course
 
@@ -54,6 +55,22 @@ class Start:
         first, second = np.triu_indices(len(scaled))
         ones = np.ones((1, given.shape[1]))
         return np.concatenate([ones, scaled, scaled[first] * scaled[second]])
+
+    def values(self, given: Sequence[Value]) -> list[Value]:
+        """The outputs as values of a graph, from those of what is set."""
+        scaled = [
+            (one - mean) * (1.0 / deviation)
+            for one, mean, deviation in zip(given, self.mean, self.deviation, strict=True)
+            if deviation > 0.0
+        ]
+        products = [one * two for place, one in enumerate(scaled) for two in scaled[place:]]
+        found = []
+        for (constant, *weights), low, high in zip(self.weights, self.low, self.high, strict=True):
+            total: Any = given[0].beside(float(constant))
+            for weight, one in zip(weights, [*scaled, *products], strict=True):
+                total = total + one * float(weight)
+            found.append(np.minimum(np.maximum(total, float(low)), float(high)))
+        return found
 
     def outputs(self, given: FloatArray) -> FloatArray:
         """The outputs, shape (k, n), from values of shape (p, n)."""

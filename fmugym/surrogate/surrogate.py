@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.lowering import Store, compile_graph
 from fmugym.expressions.program import Program, engine
@@ -34,6 +35,8 @@ class Surrogate:
         low, high: The range in which outputs stay, shape (k,).
         start: The outputs with which episodes begin.
         error: That of simulations which the fit has not seen, beside the spread of the outputs.
+        spec: What the FMU did at each step.
+        variables: What was set before initialization, P of them.
     """
 
     terms: Terms
@@ -42,6 +45,8 @@ class Surrogate:
     high: FloatArray
     start: Start
     error: float
+    spec: PoolSpec
+    variables: tuple[Variable, ...]
 
     def make_pool(
         self, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger, **options: Any

@@ -177,7 +177,8 @@ class _Data:
         """The surrogate of a form, fitted to all courses."""
         terms, (weights,) = self._weights(form, self.all, [penalty])
         start = Start.of(self.courses.variables, self.courses.all())
-        return Surrogate(terms, weights.T, *self.bounds(form), start, error)
+        about = self.courses.spec, self.courses.variables
+        return Surrogate(terms, weights.T, *self.bounds(form), start, error, *about)
 
 
 def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,16 +15,29 @@ from fmugym.episodes.simulation import given_controller
 from fmugym.errors import ConfigError, shown
 from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
+from fmugym.export.exportable import check_name
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.export.names import new_file
+from fmugym.export.surrogates import agent_of_surrogate
+from fmugym.search.excitation import fitted_surrogate
 from fmugym.search.policy import Agent as FoundAgent
-from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say_result
+from fmugym.tools.options import (
+    HELP_OF_TASK,
+    Commands,
+    add_command,
+    add_json,
+    check_numbers,
+    say_result,
+    tell,
+)
 from fmugym.tools.targets import maker_of
 from fmugym.training.agents import read_agent
 
 __all__ = ["add_export"]
 
 _ENDINGS: Final = (".c", ".fmu", ".onnx")
+_STEPS: Final = 2000
+"""Those of an FMU to which a surrogate is fitted."""
 
 
 def add_export(commands: Commands) -> None:
@@ -35,14 +49,22 @@ def add_export(commands: Commands) -> None:
         type=Path,
         nargs="?",
         metavar="AGENT",
-        help="a folder of train, or a zip file of a model",
+        help="a folder of train, or a zip file of a model; a task with --surrogate",
     )
     command.add_argument(
         "--controller",
         metavar="TEXT",
         help="instead of an agent, a controller as for simulate, or its name in the task file",
     )
-    command.add_argument("--task", required=True, metavar="TASK", help=HELP_OF_TASK)
+    command.add_argument("--task", metavar="TASK", help=HELP_OF_TASK)
+    command.add_argument(
+        "--surrogate",
+        action="store_true",
+        help="write a fast FMU that does what the FMU of a task does in simulations",
+    )
+    command.add_argument(
+        "--steps", type=int, default=_STEPS, help=f"of the FMU, for --surrogate; default {_STEPS}"
+    )
     command.add_argument(
         "--output",
         type=Path,
@@ -86,6 +108,12 @@ def _export(arguments: argparse.Namespace) -> None:
     new_file(output)
     if (arguments.agent is None) == (arguments.controller is None):
         raise ConfigError("give either AGENT or --controller")
+    if arguments.surrogate:
+        agent = _surrogate(arguments)
+        _show(agent, _written(agent, output, arguments), arguments)
+        return
+    if arguments.task is None:
+        raise ConfigError("--task is missing: the task of the agent")
     model, normalization = None, None
     if arguments.agent is not None:
         model, normalization = read_agent(arguments.agent, arguments.algorithm)
@@ -98,6 +126,26 @@ def _export(arguments: argparse.Namespace) -> None:
             model = FoundAgent("controller", text)
         agent = agent_of(env, model, normalization, name=output.stem, **options)
     _show(agent, _written(agent, output, arguments), arguments)
+
+
+def _surrogate(arguments: argparse.Namespace) -> Agent:
+    """Fit a surrogate to simulations of the FMU of a task."""
+    if arguments.output.suffix != ".fmu":
+        name = shown(arguments.output.name)
+        raise ConfigError(f"a surrogate is an FMU: expected a file that ends in .fmu, got {name}")
+    if arguments.agent is None:
+        raise ConfigError("--surrogate needs a task: fmugym export task.toml --surrogate ...")
+    check_numbers(arguments, "steps")
+    make_env = partial(maker_of(str(arguments.agent)), physical=True)
+    check_name(arguments.output.stem)
+    with closing(make_env()) as env:
+        units = env.fmu.description.units
+    found = fitted_surrogate(make_env, arguments.steps)
+    tell(
+        f"surrogate of {arguments.steps} steps: {found.terms.form}; simulations are wrong by "
+        f"{100 * found.error:.2g} % of what outputs vary"
+    )
+    return agent_of_surrogate(found, arguments.output.stem, units)
 
 
 def _written(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:

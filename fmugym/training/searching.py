@@ -258,6 +258,7 @@ class Searching:
             self._courses,
             self.steps if limited else steps,
             np.inf if limited else left,
+            self.rounds,
             self.tell,
             self.advance,
         )

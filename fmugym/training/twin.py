@@ -8,13 +8,10 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from fmugym.baselines.arena import Arena, Merit, Outcome
-from fmugym.baselines.controller import FloatArray
-from fmugym.baselines.parsing import has_range, search_of
-from fmugym.search.excitation import Excitation
-from fmugym.search.policy import Agent, Policy
+from fmugym.errors import ConfigError
+from fmugym.search.excitation import excite
+from fmugym.search.policy import Agent
 from fmugym.search.search import VALIDATION, Search
 from fmugym.surrogate.courses import Courses
 from fmugym.surrogate.surrogate import Surrogate
@@ -34,9 +31,6 @@ _EXCITED: Final = 0.4
 
 _FEWEST: Final = 4
 """in at least so many episodes."""
-
-_STARTS: Final = 32
-"""Starts of episodes without a step, which tell how episodes begin."""
 
 _CYCLES: Final = 5
 _FIRST: Final = 120
@@ -64,7 +58,7 @@ class Proof(NamedTuple):
     measured: Outcome
 
 
-class Value(NamedTuple):
+class Standing(NamedTuple):
     """How good an agent is, and what the surrogate says of the episodes that it has played."""
 
     merit: Merit
@@ -86,6 +80,7 @@ class TwinSearch:
         courses: What the FMU has done.
         steps: How many steps of the FMU there may be.
         seconds: The real time that is left.
+        rounds: The largest number of rounds.
         tell: Gets lines of text.
         advance: Is told after each round of the seconds since the last one, and of the scores.
     """
@@ -95,6 +90,7 @@ class TwinSearch:
     courses: Courses
     steps: float
     seconds: float
+    rounds: float
     tell: Callable[[str], None]
     advance: Callable[[float, str], None]
     proofs: list[Proof] = field(default_factory=list)
@@ -106,8 +102,13 @@ class TwinSearch:
         self.arena.most_steps = self.length
 
     def winner(self) -> Agent:
-        """The best agent."""
-        self._excite()
+        """The best agent.
+
+        Raises:
+            ConfigError: If nothing was found.
+        """
+        count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
+        excite(self.arena, self.courses, self.found.probe, count, self.found.rng)
         for cycle in range(_CYCLES):
             surrogate = self._fitted()
             with closing(self._arena_on(surrogate)) as twin:
@@ -116,37 +117,17 @@ class TwinSearch:
                 self._search(twin, cycle)
                 self._prove()
                 values = self._values(twin)
+            if not values:
+                raise ConfigError(
+                    f"{self.found.rounds} rounds on a surrogate are too few to find anything: give "
+                    "more --minutes"
+                )
             self._tell_of(values)
             best = max(range(len(values)), key=lambda place: values[place].merit)
-            if self._left < 1 or monotonic() > self._end or _is_close(values, best):
+            is_over = self._left < 1 or monotonic() > self._end or self.found.rounds >= self.rounds
+            if is_over or _is_close(values, best):
                 break
         return self.proofs[best].agent
-
-    # Excitation.
-
-    def _excite(self) -> None:
-        """Play episodes with the untuned controllers, whose actions are disturbed."""
-        agents, rng = self.found.probe.agents, self.found.rng
-        count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
-        if self.found.probe.is_same:
-            seeds = [0] * count
-        else:
-            seeds = rng.integers(VALIDATION, size=count).tolist()
-        for place, agent in enumerate(agents):
-            own = seeds[place :: len(agents)]
-            if own:
-                made = _excitations(agent, int(rng.integers(2**31)))
-                self.arena.play(made, np.zeros((1, 1)), own)
-        self._start_only(rng)
-
-    def _start_only(self, rng: np.random.Generator) -> None:
-        """Begin episodes without a step, unless warm-ups take steps of the FMU."""
-        envs = self.arena.open(1)
-        for _ in range(-(-_STARTS // envs.num_envs)):
-            before = self.courses.steps
-            envs.reset(seed=rng.integers(VALIDATION, size=envs.num_envs).tolist())
-            if self.found.probe.is_same or self.courses.steps > before:
-                return
 
     # The search on the surrogate.
 
@@ -168,7 +149,7 @@ class TwinSearch:
     def _search(self, twin: Arena, cycle: int) -> None:
         found, left = self.found, self._end - monotonic()
         until = monotonic() + left / 2
-        last = found.rounds + (_MORE if cycle else _FIRST)
+        last = min(self.rounds, found.rounds + (_MORE if cycle else _FIRST))
         while found.rounds < last and not found.is_over and monotonic() < until:
             begin = monotonic()
             found.advance(twin)
@@ -195,17 +176,18 @@ class TwinSearch:
         proved = [one.agent for one in self.proofs]
         best = [one.best for one in ranked if one.best]
         agents = [one for one in best[:2] if not any(one is other for other in proved)]
-        if found.baseline and not self.proofs:
-            agents.insert(0, found.baseline.best)
+        base = found.baseline or found.ahead
+        if not self.proofs and base.best:
+            agents.insert(0, base.best)
         for agent in agents[: self._left]:
             seeds = range(_PROVED, _PROVED + self._episodes)
             self.proofs.append(Proof(agent, seeds, agent.play(self.arena, seeds)))
 
-    def _values(self, twin: Arena) -> list[Value]:
+    def _values(self, twin: Arena) -> list[Standing]:
         """How good the agents are that have played on the FMU."""
         return [self._value(one, twin) for one in self.proofs]
 
-    def _value(self, proof: Proof, twin: Arena) -> Value:
+    def _value(self, proof: Proof, twin: Arena) -> Standing:
         same = proof.agent.play(twin, proof.seeds)
         count = 1 if self.found.probe.is_same else _PREDICTED
         many = proof.agent.play(twin, range(_TOLD, _TOLD + count))
@@ -214,9 +196,9 @@ class TwinSearch:
             costs=many.costs + (proof.measured.costs - same.costs).mean(axis=1, keepdims=True),
         )
         measured, predicted = (float(one.returns.mean()) for one in (proof.measured, same))
-        return Value(corrected.merits[0], predicted, measured)
+        return Standing(corrected.merits[0], predicted, measured)
 
-    def _tell_of(self, values: Sequence[Value]) -> None:
+    def _tell_of(self, values: Sequence[Standing]) -> None:
         """Tell what the surrogate has predicted, and what the FMU gives."""
         for proof, value in zip(self.proofs, values, strict=True):
             self.tell(
@@ -225,27 +207,7 @@ class TwinSearch:
             )
 
 
-def _is_close(values: Sequence[Value], best: int) -> bool:
+def _is_close(values: Sequence[Standing], best: int) -> bool:
     """Whether the surrogate is close enough to what the FMU gives, beside what is gained."""
     wrong = abs(values[best].predicted - values[best].measured)
     return wrong <= _CLOSE * abs(values[best].merit[1] - values[0].merit[1])
-
-
-def _excitations(agent: Agent, seed: int) -> Callable[[FloatArray], Excitation]:
-    """A function that makes the excitations of one group of episodes after another."""
-    first = 0
-
-    def made(rows: FloatArray) -> Excitation:
-        nonlocal first
-        begin, first = first, first + len(rows)
-        return Excitation(_untuned(agent), seed, begin)
-
-    return made
-
-
-def _untuned(agent: Agent) -> Policy:
-    """An agent whose numbers are in the middle of their ranges."""
-    if has_range(agent.text):
-        middle = np.full(len(search_of(agent.text).ranges), 0.5)
-        return agent.with_numbers(middle).policy()
-    return agent.policy() if agent.is_found else Policy(None)

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from surrogate_tools import surrogate_of
 
 from fmugym import FMUVectorEnv
 from fmugym.archive.variable import Variable
@@ -125,7 +126,7 @@ class TestPrograms:
         weights = rng.normal(size=(2, terms.count))
         low, high = np.array([-1.0, -2.0]), np.array([1.0, 2.0])
         start = Start.of((), [given])
-        surrogate = Surrogate(terms, weights, low, high, start, 0.0)
+        surrogate = Surrogate(terms, weights, low, high, start, 0.0, None, ())
         after = np.zeros((2, 40))
         surrogate.runs(rows, after)()
         expected = np.clip(rows[:2].T + terms.values(rows).T @ weights.T, low, high)
@@ -153,15 +154,7 @@ def test_courses_are_what_the_fmu_does():
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A surrogate of the pendulum."""
-    courses, rng = Courses(), np.random.default_rng(0)
-    with closing(FMUVectorEnv(PendulumEnv, 8, backend=courses)) as envs:
-        envs.reset(seed=0)
-        for _ in range(25):
-            action = rng.uniform(-2, 2, (8, 1)).astype(np.float32)
-            for _ in range(4):
-                envs.step(action)
-    return fit(courses)
+    return surrogate_of(PendulumEnv, held=4, steps=100)
 
 
 class TestPool:
@@ -199,14 +192,7 @@ class TestPool:
 
     def test_lags_begin_anew_with_each_episode(self):
         """Of a house, which has a threshold and a hidden state."""
-        courses, rng = Courses(), np.random.default_rng(0)
-        with closing(FMUVectorEnv(HouseEnv, 4, backend=courses)) as envs:
-            envs.reset(seed=0)
-            for _ in range(60):
-                action = rng.uniform(0, 1, (4, 1)).astype(np.float32)
-                for _ in range(3):
-                    envs.step(action)
-        found = fit(courses)
+        found = surrogate_of(HouseEnv, held=3, steps=180)
         assert found.terms.form.lags > 0
         with closing(FMUVectorEnv(HouseEnv, 2, backend=found)) as twin:
             rows = []

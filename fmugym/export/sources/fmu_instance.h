@@ -110,11 +110,15 @@ static bool get_action(const Controller *controller, unsigned place, double *val
     return true;
 }
 
-/* The outputs keep what the initialization has led to until the first step. */
+/* The outputs keep what the initialization has led to until the first step. A plant has taken its
+ * first sample then, and a controller takes it in the first step. */
 static bool end_initialization(Controller *controller) {
     AGENT_STATE agent = controller->memory.agent;
     if (!sample(controller, &agent, controller->memory.actions)) {
         return false;
+    }
+    if (IS_PLANT) {
+        controller->memory.agent = agent;
     }
     controller->memory.mode = STEPPING;
     return true;
