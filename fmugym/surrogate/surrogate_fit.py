@@ -90,7 +90,7 @@ class _Data:
 
     def extensions(self, form: Form) -> Iterator[Form]:
         """The forms that have one thing more."""
-        if form.lags < _LAGS:
+        if form.lags < min(_LAGS, self.horizon - 1):
             yield replace(form, lags=form.lags + 1)
         if not form.quadratic:
             yield replace(form, quadratic=True)
@@ -109,8 +109,9 @@ class _Data:
     # The fit of one form.
 
     def _matrices(self, form: Form, courses: Sequence[Course]) -> tuple[FloatArray, FloatArray]:
-        rows = np.concatenate([rows_of(form, one) for one in courses], axis=1)
-        changes = np.concatenate([np.diff(one.outputs, axis=0) for one in courses])
+        first = form.lags  # before this step, what a course begins with does not tell its past
+        rows = np.concatenate([rows_of(form, one)[:, first:] for one in courses], axis=1)
+        changes = np.concatenate([np.diff(one.outputs, axis=0)[first:] for one in courses])
         return rows, changes / self.size
 
     def _weights(
