@@ -15,7 +15,9 @@ from fmugym.surrogate.courses import Course
 
 __all__ = ["Start"]
 
-_PENALTY: Final = 1e-6
+_PENALTY: Final = 1e-8
+_BEYOND: Final = 0.5
+"""Outputs begin in their range in the courses, which is so much wider on both sides."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,9 @@ class Start:
         first = np.array([one.outputs[0] for one in courses])
         deviation = given.std(axis=0)
         names = tuple(one.name for one in variables)
-        known = names, given.mean(axis=0), deviation, first.min(axis=0), first.max(axis=0)
+        beyond = _BEYOND * np.ptp(first, axis=0)
+        low, high = first.min(axis=0) - beyond, first.max(axis=0) + beyond
+        known = names, given.mean(axis=0), deviation, low, high
         terms = cls(*known, np.zeros(0))._terms(given.T)
         square = terms @ terms.T / len(given) + _PENALTY * np.eye(len(terms))
         return cls(*known, np.linalg.solve(square, terms @ first / len(given)).T)

@@ -79,10 +79,10 @@ class Surrogate:
         self, place: int, now: Value, factors: Sequence[Value], weights: Sequence[Any]
     ) -> Value:
         """An output after the step."""
-        total = now + self.terms.total(factors, weights)
+        total: Any = now + self.terms.total(factors, weights)
         low, high = float(self.low[place]), float(self.high[place])
-        found: Value = np.minimum(np.maximum(total, low), high)  # type: ignore[assignment]
-        return found if np.isfinite(low) else total
+        found: Value = np.minimum(np.maximum(total, low), high) if np.isfinite(low) else total
+        return found
 
     def runs(self, rows: FloatArray, after: FloatArray) -> Callable[[], None]:
         """A function that reads what a step depends on, and writes the outputs after it.
@@ -95,9 +95,15 @@ class Surrogate:
         programs, numbers = self.programs()
         factors: FloatArray = np.zeros((self.terms.factor_count, count))
         repeated = np.repeat(np.reshape(numbers, (-1, 1)), count, axis=1)
-        arrays = {"x": rows, "factor": factors, "number": repeated, "next": after}
-        parts = [one.with_rows(lambda row: arrays[row[0]][row[1]]) for one in programs]
+        arrays: dict[str, Any] = {"x": rows, "factor": factors, "number": repeated, "next": after}
         nothing = np.zeros(count)
+
+        def find(row: Any) -> FloatArray:
+            name, place = row
+            found: FloatArray = arrays[name][place]
+            return found
+
+        parts = [one.with_rows(find) for one in programs]
 
         def run() -> None:
             for one in parts:

@@ -66,7 +66,7 @@ class _Data:
         self.all = [one for one in courses.all() if one.steps]
         if not self.all or spec is None:
             raise ConfigError("a surrogate needs courses with steps")
-        self.courses = courses
+        self.courses, self.spec = courses, spec
         self.widths = len(spec.outputs), len(spec.inputs)
         angles = [i for i, one in enumerate(spec.outputs) if one.unit == "rad"]
         self.linear = Form(angles=tuple(angles))
@@ -178,8 +178,9 @@ class _Data:
         """The surrogate of a form, fitted to all courses."""
         terms, (weights,) = self._weights(form, self.all, [penalty])
         start = Start.of(self.courses.variables, self.courses.all())
-        about = self.courses.spec, self.courses.variables
-        return Surrogate(terms, weights.T, *self.bounds(form), start, error, *about)
+        low, high = self.bounds(form)
+        about = self.spec, self.courses.variables
+        return Surrogate(terms, weights.T, low, high, start, error, *about)
 
 
 def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:

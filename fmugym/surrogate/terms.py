@@ -136,15 +136,15 @@ class Terms:
     @property
     def factor_count(self) -> int:
         """How many factors there are."""
-        return self.mixing.shape[1] - 1 + len(self.mixing) + len(self.form.thresholds)
+        return int(self.mixing.shape[1]) - 1 + len(self.mixing) + len(self.form.thresholds)
 
-    def _scaled(self, row: Sequence[Value], number: Number = float) -> list[Value]:
+    def _scaled(self, row: Sequence[Any], number: Number = float) -> list[Value]:
         """The factors that are scaled numbers; what is constant in the courses is none."""
         outputs = self.widths[0]
         found: list[Value] = []
         for place, value in enumerate(row):
             if place < outputs and place in self.form.angles:
-                found += [np.sin(value), np.cos(value)]  # type: ignore[list-item]
+                found += [np.sin(value), np.cos(value)]
             elif self.deviation[place] > 0.0:
                 low, high, mean = map(number, (self.low[place], self.high[place], self.mean[place]))
                 inside: Any = np.minimum(np.maximum(value, low), high)
@@ -164,7 +164,7 @@ class Terms:
             total = row[0].beside(number(constant))
             for weight, value in zip(weights, scaled, strict=True):
                 total = total + value * number(weight)
-            found.append(np.tanh(total))  # type: ignore[arg-type]
+            found.append(np.tanh(total))
         return found + [
             where(row[self.first_input + place] > value, 1.0, 0.0)
             for place, value in self.form.thresholds
