@@ -21,7 +21,8 @@ class Wishes:
     Attributes:
         backend: ``"native"``, ``"fmpy"`` (see ``FMPyInstance``), or ``"auto"`` (also ``"fmu"``):
             native if the extension was built. Or an object that replaces the FMU; see
-            ``BackendPool``.
+            ``BackendPool``. One with the method ``make_pool`` makes the pool itself, as a
+            ``Surrogate`` does.
         reset_method: One of ``ResetMethod``; by default the fastest one that gives correct
             results in the trial.
         threads: See ``NativePool``; FMPy has one thread. By default one if instances disturb each

@@ -100,9 +100,10 @@ def excite(
             made = _excitations(agent, int(rng.integers(_SEEDS)))
             arena.play(made, np.zeros((1, 1)), own)
     envs = arena.open(1)
-    for _ in range(-(-_STARTS // envs.num_envs)):
+    starts = rng.integers(_SEEDS, size=_STARTS)
+    for begin in range(0, _STARTS, envs.num_envs):
         before = courses.steps
-        envs.reset(seed=rng.integers(_SEEDS, size=envs.num_envs).tolist())
+        envs.reset(seed=np.resize(starts[begin:], envs.num_envs).tolist())
         if probe.is_same or courses.steps > before:  # warm-ups take steps, too
             return
 

@@ -40,17 +40,18 @@ class Start:
 
     @classmethod
     def of(cls, variables: Sequence[Variable], courses: Sequence[Course]) -> Start:
-        """The fit to the starts of courses."""
-        given = np.array([one.starts for one in courses])
-        first = np.array([one.outputs[0] for one in courses])
+        """The fit to the starts of courses, equal ones once."""
+        several = list({one.starts.tobytes(): one for one in courses}.values())
+        given = np.array([one.starts for one in several])
+        first = np.array([one.outputs[0] for one in several])
         deviation = given.std(axis=0)
         names = tuple(one.name for one in variables)
         beyond = _BEYOND * np.ptp(first, axis=0)
         low, high = first.min(axis=0) - beyond, first.max(axis=0) + beyond
-        known = names, given.mean(axis=0), deviation, low, high
-        terms = cls(*known, np.zeros(0))._terms(given.T)
+        about = names, given.mean(axis=0), deviation, low, high
+        terms = cls(*about, np.zeros(0))._terms(given.T)
         square = terms @ terms.T / len(given) + _PENALTY * np.eye(len(terms))
-        return cls(*known, np.linalg.solve(square, terms @ first / len(given)).T)
+        return cls(*about, np.linalg.solve(square, terms @ first / len(given)).T)
 
     def _terms(self, given: FloatArray) -> FloatArray:
         """Shape (f, n): 1, the scaled values that differ, and their products."""

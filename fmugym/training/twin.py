@@ -32,6 +32,13 @@ _EXCITED: Final = 0.4
 _FEWEST: Final = 4
 """in at least so many episodes."""
 
+_FEWEST_PLAYED: Final = 6
+"""The steps have so many episodes at least: those that excite, one of the tuned controller and one
+of a policy."""
+
+_DIVIDED: Final = 16
+"""Where they have more than so many, episodes are as long as those of the task."""
+
 _CYCLES: Final = 5
 _FIRST: Final = 120
 _MORE: Final = 40
@@ -97,8 +104,8 @@ class TwinSearch:
 
     def __post_init__(self) -> None:
         self._end = monotonic() + self.seconds
-        most = self.found.probe.most_steps
-        self.length = int(min(most, max(self.steps // 16, min(most / 2, self.steps // 6))))
+        most, left = self.found.probe.most_steps, self.steps - self.arena.steps
+        self.length = int(min(most, max(left // _DIVIDED, min(most / 2, left // _FEWEST_PLAYED))))
         self.arena.most_steps = self.length
 
     def winner(self) -> Agent:

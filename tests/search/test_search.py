@@ -1257,12 +1257,15 @@ class Budget:
 
 class TestBudget:
     @pytest.mark.parametrize("envs", [512, 11])
-    @pytest.mark.parametrize("ceiling", [5_000, 40_000])
-    def test_steps_are_a_ceiling_of_all_but_the_test(self, ceiling, envs, folder, monkeypatch):
+    @pytest.mark.parametrize(("ceiling", "part"), [(5_000, 0.3), (40_000, 0.7)])
+    def test_steps_are_a_ceiling_of_all_but_the_test(
+        self, ceiling, part, envs, folder, monkeypatch
+    ):
+        """With 5,000 steps, a surrogate plays, and what it predicts may be right at once."""
         budget = Budget(monkeypatch)
         limits = {"rounds": np.inf, "minutes": 60, "steps": ceiling, "envs": envs}
         facts = searched(folder, **limits)
-        assert 0.5 * ceiling < facts["steps"] <= ceiling
+        assert part * ceiling < facts["steps"] <= ceiling
         assert 0 <= facts["steps"] - budget.steps < MOST_PROBED
 
     def test_what_fits_a_ceiling_depends_on_no_time(self, tmp_path, monkeypatch):

@@ -1,0 +1,41 @@
+"""Excitation: what it does depends on its seed only, and shows all of the range."""
+
+from contextlib import closing
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fmugym.baselines.arena import Arena
+from fmugym.envs import CartPoleEnv, PendulumEnv
+from fmugym.search.excitation import excite
+from fmugym.search.policy import Agent
+from fmugym.surrogate.courses import Courses
+
+
+def excited(make_env, envs, steps=60, count=7):
+    courses = Courses()
+    probe = SimpleNamespace(agents=[Agent("constant action", acting=1)], is_same=False)
+    with closing(Arena(make_env, envs, steps, backend=courses)) as arena:
+        excite(arena, courses, probe, count, np.random.default_rng(5))
+        assert arena.steps == courses.steps
+    return [one for one in courses.all() if one.steps]
+
+
+@pytest.mark.parametrize("make_env", [PendulumEnv, CartPoleEnv])
+def test_it_does_not_depend_on_the_number_of_environments(make_env):
+    """Actions of the second are levels."""
+    several, few = (
+        sorted(excited(make_env, envs), key=lambda one: one.starts.tolist()) for envs in (7, 3)
+    )
+    assert len(several) == len(few) == 7
+    for one, other in zip(several, few, strict=True):
+        assert np.array_equal(one.inputs, other.inputs)
+        assert np.array_equal(one.outputs, other.outputs)
+
+
+def test_actions_reach_the_ends_and_differ_from_episode_to_episode():
+    torques = np.array([one.inputs[:, 0] for one in excited(PendulumEnv, 7)])
+    assert (torques.min(), torques.max()) == pytest.approx((-2, 2))
+    assert len(np.unique(torques.round(6))) > 30
+    assert len(np.unique(torques, axis=0)) == 7
