@@ -15,7 +15,7 @@ from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
 from fmugym.search.policy import Agent, scale_of
-from fmugym.search.probe import FEW, Probe
+from fmugym.search.probe import FEW, MOST_PROBED, Probe
 
 __all__ = ["VALIDATION", "Search", "tuning_steps"]
 
