@@ -47,6 +47,9 @@ _GROUP: Final = 8
 _OF_PROBE: Final = 20
 """The look at a task takes one step of so many."""
 
+_OF_TEST: Final = 4
+"""The test by which controllers are guessed takes one step of so many, at most."""
+
 _EPISODES: Final = 8
 """Steps are divided among so many episodes, or more if these are shorter."""
 
@@ -64,7 +67,14 @@ def fitted_surrogate(make_env: Callable[[], Any], steps: int, seed: int = 0) -> 
     """
     courses, rng = Courses(), np.random.default_rng(seed)
     most = max(_GROUP, steps // _OF_PROBE)
-    probe = Probe.of(make_env, _GROUP, lambda line: None, most, courses)
+    probe = Probe.of(
+        make_env,
+        _GROUP,
+        lambda line: None,
+        most_tested=steps // _OF_TEST,
+        most=most,
+        backend=courses,
+    )
     length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
     with closing(Arena(make_env, _GROUP, length, backend=courses)) as arena:
         excite(arena, courses, probe, (steps - courses.steps) // length, rng)

@@ -134,6 +134,8 @@ def _surrogate(arguments: argparse.Namespace) -> Agent:
     if arguments.output.suffix != ".fmu":
         name = shown(arguments.output.name)
         raise ConfigError(f"a surrogate is an FMU: expected a file that ends in .fmu, got {name}")
+    if arguments.agent is None:
+        raise ConfigError("--surrogate needs a task: fmugym export task.toml --surrogate ...")
     check_numbers(arguments, "steps")
     make_env = partial(maker_of(str(arguments.agent)), physical=True)
     check_name(arguments.output.stem)

@@ -160,9 +160,7 @@ class Searching:
         agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
         self.tell(f"to be beaten: {', '.join(dict.fromkeys(agents))}")
         self.folder.mkdir(parents=True, exist_ok=True)
-        found = Search(probe, self.seed)
-        found.steps = most
-        return found
+        return Search(probe, self.seed)
 
     def _resumed(self) -> Search:
         """Read the state of a search.
