@@ -76,7 +76,8 @@ class TestTrain:
         document = TWO | {"controllers": {"brake": brake, "pair": {"a": loop, "b": "brake"}}}
         folder = tmp_path / "agent"
         options = "--output", folder, "--rounds", "20", "--episodes", "2"
-        code, out, err = cli("train", written(document), *options)
+        file = written(document)
+        code, out, err = cli("train", file, *options)
         assert code == 0, err
         assert "to be beaten: pair (to be tuned)" in out + err
         assert "left out" not in err  # the brake is a part of the table
@@ -85,7 +86,7 @@ class TestTrain:
         assert facts["agent"] == "tuned pair"
         assert list(entries) == ["a", "b"]
         assert ".." not in facts["controller"]
-        played = ("simulate", written(document), "--seed", 500, "--json")
+        played = ("simulate", file, "--seed", 500, "--json")
         told = [
             json.loads(cli(*played, *who)[1])["episodes"][0]["total_reward"]
             for who in (("--agent", folder), ("--controller", facts["controller"]))

@@ -361,7 +361,7 @@ def test_an_exported_agent_has_all_files(load_in, tmp_path):
     network = network_for(env)
     agent = agent_of(env, network)
     assert [one.name for one in agent.logic.parameters] == [NUMBER]
-    seeds = {int(env.reset(seed=seed)[1]["drawn"][NUMBER]): seed for seed in range(6)}
+    seeds = {int(env.reset(seed=seed)[1]["drawn"][NUMBER]): seed for seed in range(20)}
     assert seeds.keys() == {0, 1, 2}
     for number in (1, 2):
         own = tmp_path / str(number)

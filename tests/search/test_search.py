@@ -1213,7 +1213,11 @@ class TestSearch:
             "warm_up": {"period": "50ms", "controller": {"tau": "lazy"}},
         }
         facts = searched(folder, **two, told=told, rounds=8)
-        assert told[0] == "left out: lazy, pi, still: there are several actions, and each gives one"
+        left_out = [line.split(": ")[1] for line in told[:3]]
+        assert left_out == [*two["controllers"]]
+            *two["controllers"]
+        ]
+        assert told[0].startswith("left out: lazy: Schedule gives one number, but the action")
         assert facts["baseline"] == "constant action"
 
     def test_few_rounds_give_what_they_have_come_to(self, folder):
