@@ -224,9 +224,8 @@ class _Guess:
     @cached_property
     def _moved(self) -> Mapping[str, bool]:
         """Whether actions move an observation, by its name."""
-        gains: Any = self.responses.gains
-        moved = [bool(row.any()) for row in gains]
-        return dict(zip(self.responses.names, moved, strict=True))
+        rows = zip(self.responses.names, self.responses.gains, strict=True)
+        return {name: bool(row.any()) for name, row in rows}
 
     def _setpoint(self, of: str) -> str | float | None:
         """The set point of a value, which no action moves; None if it has none."""

@@ -120,8 +120,8 @@ class StepResponses:
     def is_instant(self) -> BoolArray:
         """Which observations tell what an action is: they do not change later, shape (k,)."""
         first, last = np.abs(self._means[[0, -1]])
-        found: BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
-        return found
+        instant: BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
+        return instant
 
 
 class _Held(Controller):

@@ -1215,8 +1215,6 @@ class TestSearch:
         facts = searched(folder, **two, told=told, rounds=8)
         left_out = [line.split(": ")[1] for line in told[:3]]
         assert left_out == [*two["controllers"]]
-            *two["controllers"]
-        ]
         assert told[0].startswith("left out: lazy: Schedule gives one number, but the action")
         assert facts["baseline"] == "constant action"
 
