@@ -114,6 +114,11 @@ class TwinSearch:
         Raises:
             ConfigError: If nothing was found.
         """
+        if self.length < 1:
+            raise ConfigError(
+                f"{self.found.rounds} rounds are too few to find anything, and there are no steps "
+                "for a surrogate: give more --minutes or --steps"
+            )
         count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
         excite(self.arena, self.courses, self.found.probe, count, self.found.rng)
         for cycle in range(_CYCLES):
