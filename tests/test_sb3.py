@@ -279,7 +279,7 @@ def test_methods_of_all_and_of_some_keep_what_they_write(make):
 def test_methods_that_would_part_an_environment_from_the_others_are_refused(make):
     class Meddling(CartPoleEnv):
         def meddle(self):
-            self.step_count = 0
+            self.config = None
 
     venv = make(Meddling)
     venv.reset()
@@ -287,7 +287,7 @@ def test_methods_that_would_part_an_environment_from_the_others_are_refused(make
         with pytest.raises(ConfigError, match=method):
             venv.env_method(method)
     venv.step(np.zeros(3, np.int64))
-    with pytest.raises(ConfigError, match="'step_count'"):
+    with pytest.raises(ConfigError, match="'config'"):
         venv.env_method("meddle")
 
 
