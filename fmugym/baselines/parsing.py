@@ -192,7 +192,7 @@ class TableSearch(Search):
     searches: Mapping[str, Search]
 
     @property
-    def ranges(self) -> Mapping[str, Uniform | LogUniform]:  # type: ignore[override]
+    def ranges(self) -> Mapping[str, Uniform | LogUniform]:  # type: ignore[override]  # a field there
         """See ``Search``."""
         return {
             f"{name}.{key}": one

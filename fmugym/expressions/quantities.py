@@ -2,7 +2,8 @@
 
 From this table come the arrays of N episodes, the numbers of one, the attributes of environments
 that hooks read, the columns of snapshots, and the names that formulas use. A new quantity is a line
-here, the line that writes it, and a sentence in ``docs/class.md``.
+here, what writes it (in Python for numbers and for arrays, in C for programs), and a sentence in
+``docs/class.md``.
 """
 
 from __future__ import annotations

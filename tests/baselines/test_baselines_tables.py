@@ -1,5 +1,7 @@
 """Controllers of several actions, on linear plants whose steps are known exactly."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -262,7 +264,7 @@ def test_plans_begin_with_a_table(linear):
 
 
 class TestTexts:
-    TABLE = {  # noqa: RUF012
+    TABLE: ClassVar = {
         "u1": "pid of=y1 'setpoint=wish + 0.5' kp=-2",
         "valve 2": 1,
         "wish": {"controller": 'pid of="y 2" setpoint=0 kp=1.5', "min": -1, "max": 2.5},
