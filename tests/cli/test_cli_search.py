@@ -326,14 +326,18 @@ CRANE = {
     ids=["cart-pole", "cloud-pendulum", "crane"],
 )
 def test_targets_are_reached(task, rounds, target, tmp_path, ran):
-    """By the mean of 100 episodes of the test."""
+    """By the mean of 100 episodes of the test, in the median of three seeds."""
     if task is CRANE:
         task = tmp_path / "crane.toml"
         fmugym.Task.from_dict(CRANE).write(task)
-    options = "--output", tmp_path / "a", "--rounds", rounds, "--json"
-    told = json.loads(ran("train", task, *options))
-    assert told["test"][told["agent"]]["total_reward"] >= target
-    assert len(told["test"][told["agent"]]["rewards"]["unseen episodes"]) == 100
+    reached = []
+    for seed in range(3):
+        options = "--output", tmp_path / f"{seed}", "--rounds", rounds, "--seed", seed, "--json"
+        told = json.loads(ran("train", task, *options))
+        test = told["test"][told["agent"]]
+        assert len(test["rewards"]["unseen episodes"]) == 100
+        reached.append(test["total_reward"])
+    assert sorted(reached)[1] >= target
 
 
 class Bar:
