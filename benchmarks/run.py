@@ -23,6 +23,7 @@ from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import arrays
 import exchange
 import heavy
 import isolation
@@ -45,6 +46,7 @@ from tables import Table
 SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "single": single.tables,
     "vector": vector.tables,
+    "arrays": arrays.tables,
     "tasks": tasks.tables,
     "reset": reset.tables,
     "rollouts": rollouts.tables,

@@ -29,7 +29,7 @@ enum {
     WHOLE = 16,           /* number of items whose 32-bit values fill a cache line */
     FANOUT = 2,           /* number of helpers that each thread wakes */
     STACK_SIZE = 8 << 20, /* as for the main thread on most systems: FMUs may rely on it */
-    HELPER_SPIN = 20000,  /* ns to look for more work before going to sleep */
+    HELPER_SPIN = 50000,  /* ns to look for more work before going to sleep */
     CALLER_SPIN = 5000,   /* ns to wait for the last chunks before going to sleep */
     CALLER_LOOK = 50      /* ms to sleep before it looks what else there is */
 };
