@@ -63,6 +63,7 @@ def _runs(stack: ExitStack, mode: AutoresetMode, size: int) -> Iterator[tuple[st
             pool.step()
             one._is_done()
             one._reward_policy()
+            one.state.T.astype(np.float32)  # the observations
 
     for name, block in (("step", steps), ("by hand", by_hand)):
         yield name, repeated(block, STEPS, prepare=env.reset)

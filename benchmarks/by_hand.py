@@ -29,7 +29,6 @@ __all__ = [
     "PendulumByHand",
     "SwingUpByHand",
     "TrackingByHand",
-    "UncompiledByHand",
 ]
 
 Floats = npt.NDArray[np.float64]
@@ -223,15 +222,6 @@ class TrackingByHand(ByHand):
         error = self.variables["target"] - q
         rows = [np.sin(q), np.cos(q), q_dot, error, self.variables["integral"]]
         return np.stack(rows, axis=1).astype(np.float32)
-
-
-class UncompiledByHand(TrackingByHand):
-    """``Uncompiled``."""
-
-    def _observe(self) -> Any:
-        observation = super()._observe()
-        observation[:, 4] = np.partition(observation, 2, axis=1)[:, 2]
-        return observation
 
 
 class GoalByHand(ByHand):

@@ -35,6 +35,20 @@ LEFT_OUT = {
 SIZES = (1, 8, 64, 1024)
 
 
+class CartPoleOfOne(CartPoleOnArrays):
+    """The cart-pole with hooks as one writes them for a single environment."""
+
+    def _get_inputs(self) -> Any:
+        return 10.0 if self.action == 1 else -10.0
+
+    def _is_done(self) -> Any:
+        x, _, phi, _ = self.state
+        return abs(x) > 2.4 or abs(phi) > 0.2094
+
+    def _reward_policy(self) -> Any:
+        return 0.0 if self.after_end else 1.0
+
+
 def _readme(effort: Effort) -> list[Table]:
     """The tables of the section "Speed" of the README."""
     steps = vector.tables(effort)[0]
@@ -97,10 +111,13 @@ def _single_makers(stack: ExitStack) -> dict[str, Callable[[], Run]]:
         env.action_space.seed(0)
         return cart_poles.environment_run(env, [env.action_space.sample() for _ in range(512)])
 
-    spec = EnvSpec("benchmarks/CartPole-v0", CartPoleOnArrays, max_episode_steps=500)
+    def of(entry_point: Any) -> EnvSpec:
+        return EnvSpec("benchmarks/CartPole-v0", entry_point, max_episode_steps=500)
+
     return {
         "expressions": lambda: make("fmugym/CartPole-v0"),
-        "hooks in Python": lambda: make(spec),
+        "hooks in Python": lambda: make(of(CartPoleOfOne)),
+        "those that take arrays, too": lambda: make(of(CartPoleOnArrays)),
         "Gymnasium's own": lambda: make("CartPole-v1"),
     }
 

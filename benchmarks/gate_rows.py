@@ -80,7 +80,7 @@ class CartPoleOnArrays(fmugym.FMI2CSEnv):
 
     def _is_done(self) -> Any:
         x, _, phi, _ = self.state
-        return (np.abs(x) > 2.4) | (np.abs(phi) > 0.2094)
+        return (abs(x) > 2.4) | (abs(phi) > 0.2094)
 
     def _reward_policy(self) -> Any:
         return 1.0 - (self.done & self.after_end)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Final
 
 from fmugym.archive.description import ModelDescription
@@ -191,7 +192,7 @@ class PoolSpec:
         """How a pool treats the FMU as a whole: components with methods of their own are reset."""
         return ResetMethod.RESET if self.component_resets else self.reset_method
 
-    @property
+    @cached_property
     def makes_anew(self) -> bool:
         """Whether resets make instances anew."""
         return any(one not in REUSING for one in (self.reset_method, *self.component_resets))

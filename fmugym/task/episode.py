@@ -177,6 +177,8 @@ class EpisodeDraws:
     def shown(self, values: Sequence[Any] | FloatArray) -> dict[str, Any]:
         """The same as ``named``, but Strings are texts, or arrays of them."""
         named = self.named(values)
+        if not self.strings:
+            return named
         own = self.strings.keys() & named.keys()
         return named | {name: texts_at(self.strings[name], named[name]) for name in own}
 

@@ -22,7 +22,6 @@ __all__ = [
     "copy_rows",
     "drawn_info",
     "final_infos",
-    "is_surely_finite",
     "last_observations",
     "late_info",
     "merged",
@@ -110,12 +109,6 @@ def copy_rows(source: Any, target: Any, mask: MaskArray) -> None:
     mapped(copy, target, source)
 
 
-def is_surely_finite(values: npt.NDArray[Any]) -> bool:
-    """Whether the sum of squares is finite: that takes half the time of ``np.isfinite``."""
-    flat = values.ravel()
-    return isfinite(flat.dot(flat))
-
-
 def not_finite(values: Any) -> MaskArray | None:
     """Which rows of an array, or of a dict of arrays, hold NaN or infinity; None for no row."""
     if type(values) is dict:
@@ -123,7 +116,7 @@ def not_finite(values: Any) -> MaskArray | None:
         return np.logical_or.reduce(found) if found else None
     if values.dtype.kind != "f":
         return None
-    if is_surely_finite(values):
+    if isfinite(np.vdot(values, values)):  # two thirds of the time of what follows
         return None
     finite = np.isfinite(values)
     if np.count_nonzero(finite) == finite.size:  # a third of the time of finite.all()

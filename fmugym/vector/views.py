@@ -151,7 +151,8 @@ class ColumnReadings(Readings):
         batch.done[index] = batch.after_end[index] = False
         self.parameters = parameters
         for name, value in variables.items():
-            batch.variables[name][..., index] = value
+            row = batch.variables[name]
+            row[index if row.ndim == 1 else (..., index)] = value
 
     def look(self, outputs: FloatArray) -> None:
         """See ``Readings.look``; the arrays have the outputs already."""

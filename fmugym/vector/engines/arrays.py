@@ -102,22 +102,15 @@ class ArrayEngine(BatchEngine):
             read.action, read.previous_action, read.previous_state = before
 
     def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
-        """See ``BatchEngine._completed``."""
+        """See ``BatchEngine._completed``; the hooks that follow the FMUs' step are called."""
+        env, inside = self.env, self.env.inside
         result, troubled, _, started = played
         started = idle if started is None else started
-        result = self._concluded(result, troubled, started)
-        self._settle(result, troubled, started)
-        return result
-
-    def _concluded(
-        self, result: StepResult, troubled: int, started: MaskArray | None
-    ) -> StepResult:
-        """Call the hooks that follow the FMUs' step."""
-        env, inside = self.env, self.env.inside
-        idle = failed_in(self._pool.statuses) if troubled else None
-        if started is not None:
-            idle = started if idle is None else idle | started
-        self._idle, self._busy = idle, None if idle is None else ~idle
+        self._idle = started
+        if troubled:
+            failed = failed_in(self._pool.statuses)
+            self._idle = failed if started is None else failed | started
+        self._busy = None if self._idle is None else ~self._idle
         observed = result.observations if inside.pool_observes else None
         try:
             stopped = result.terminated if troubled else False
@@ -135,13 +128,15 @@ class ArrayEngine(BatchEngine):
             self._blame_arrays(error)
             raise
         if started is not None:  # a third of the time of assignments with a mask
-            running = self._busy if idle is started else ~started
+            running = self._busy if self._idle is started else ~started
             terminated &= running
             truncated &= running
             np.copyto(rewards, 0.0, where=started)
         self._memory.keep_done(terminated)
         self.note_ends(terminated, truncated)
-        return StepResult(seen, rewards, terminated, truncated, infos)
+        result = StepResult(seen, rewards, terminated, truncated, infos)
+        self._settle(result, troubled, started)
+        return result
 
     def _blame_arrays(self, error: Exception) -> None:
         """Say which hook has not worked on arrays, until all have done so in a first step.

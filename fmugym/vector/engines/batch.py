@@ -7,6 +7,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from math import isfinite
 from types import MappingProxyType, MethodType
 from typing import Any
 
@@ -44,14 +45,7 @@ from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import (
-    copy_rows,
-    drawn_info,
-    is_surely_finite,
-    late_info,
-    not_finite,
-    observation_of,
-)
+from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
     columns_of,
@@ -588,7 +582,7 @@ class BatchEngine(Engine):
         return [i for i in range(self._n) if resetting is None or not resetting[i]]
 
     def _require_finite(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
-        if is_surely_finite(inputs):
+        if isfinite(np.vdot(inputs, inputs)):  # half the time of what follows
             return
         finite = np.isfinite(inputs)
         for index in self._stepping(resetting):
