@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
@@ -20,6 +21,7 @@ from fmugym.baselines.controller import Controller, FloatArray, attribute_of
 from fmugym.baselines.observer import COPIES, CORRECTION, Observer, spread
 from fmugym.checks import (
     LARGEST_COUNT,
+    check_count,
     check_flag,
     check_integer,
     check_number,
@@ -29,7 +31,7 @@ from fmugym.checks import (
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.task.future import Future
-from fmugym.task.snapshot import Snapshot
+from fmugym.task.snapshot import Snapshot, scope_of
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["MPC"]
@@ -46,6 +48,9 @@ _PENALTY: Final = 1e9
 
 _FAILURE: Final = 1e100
 """How much each step counts that a plan lacks because a copy has failed."""
+
+_SURROGATE: Final = "surrogate"
+"""The name of a model that is fitted to the FMU."""
 
 _FORECAST: Final = re.compile(r"(.+)\[\+(.+) s\]")
 
@@ -89,7 +94,9 @@ class MPC(Controller):
         seed: Of the candidates. The same arguments give the same actions.
         model: A function that makes the environment to plan with, which has the observations and
             actions of the controlled one. By default that is copied; the environments of
-            ``fmugym.plant`` know one.
+            ``fmugym.plant`` know one. Or ``"surrogate"``: plans are tried on a surrogate of the
+            FMU, for FMUs that are too slow for plans in real time; see ``fmugym.surrogate``.
+        steps: How many steps of the FMU a surrogate is fitted to, when the controller is bound.
     """
 
     def __init__(
@@ -103,7 +110,8 @@ class MPC(Controller):
         states: Mapping[str, str] | str | None = None,
         perfect: bool = False,
         seed: int = 0,
-        model: Callable[[], Any] | None = None,
+        model: Callable[[], Any] | str | None = None,
+        steps: int = 2000,
     ) -> None:
         self.horizon = check_number("horizon", duration("horizon", horizon), positive=True)
         self.rounds = check_integer("rounds", rounds, 1, LARGEST_COUNT)
@@ -114,9 +122,13 @@ class MPC(Controller):
         self.perfect = check_flag("perfect", perfect)
         self.states = _pairs(states)
         self.seed = check_seed(seed) or 0
-        if model is not None and not callable(model):
-            raise ConfigError(f"model must be a function, got {shown(model)}")
+        if model not in (None, _SURROGATE) and not callable(model):
+            raise ConfigError(f"model must be a function or {_SURROGATE!r}, got {shown(model)}")
+        if model == _SURROGATE and self.perfect:
+            raise ConfigError("a perfect MPC knows the FMU itself: leave out 'model' or 'perfect'")
         self.model = model
+        self.steps = check_count("steps", steps)
+        self._surrogate: Any = None
         self._copies: Any = None
         """The copies; the first nine run beside an environment, and all try plans."""
 
@@ -148,8 +160,9 @@ class MPC(Controller):
         self._plan_shape = steps, self._low.size
         make = self._model_of()
         self._many = max(COPIES, self.candidates // self.rounds)
+        backend = self._fitted(make) if self.model == _SURROGATE else "auto"
         self._copies = FMUVectorEnv(
-            partial(_that_goes_on, make), self._many, autoreset_mode="Disabled"
+            partial(_that_goes_on, make), self._many, autoreset_mode="Disabled", backend=backend
         )
         self._prototype = self._copies.inside.prototype
         future = self._prototype.inside.future or Future({}, (), float)
@@ -170,9 +183,28 @@ class MPC(Controller):
             raise ConfigError("MPC needs actions with limits: give their variables 'min' and 'max'")
         return sides
 
+    def _fitted(self, make: Callable[[], Any]) -> Any:
+        """A surrogate of the FMU. One that was fitted to the same FMU and config is kept."""
+        env: FMUEnv = attribute_of(self._env, "unwrapped")
+        scope = scope_of(env)
+        if self._surrogate is None or self._surrogate[0] != scope:
+            # The search for policies, which excites the FMU, needs controllers itself.
+            excitation = import_module("fmugym.search.excitation")
+            found, _ = excitation.fitted_surrogate(make, self.steps, self.seed)
+            env.logger.info(
+                "%s plans on a surrogate of %d steps: %s; simulations are wrong by %.2g %% of what "
+                "outputs vary",
+                type(self).__name__,
+                self.steps,
+                found.terms.form,
+                100 * found.error,
+            )
+            self._surrogate = scope, found
+        return self._surrogate[1]
+
     def _model_of(self) -> Callable[[], Any]:
         """What makes copies."""
-        if self.model is not None:
+        if callable(self.model):
             return self.model
         env: FMUEnv = attribute_of(self._env, "unwrapped")
         if env.inside.model is not None:

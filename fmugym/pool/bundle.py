@@ -21,6 +21,7 @@ __all__ = [
     "ended_state",
     "head_of",
     "outputs_of",
+    "surrogate_state",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -30,7 +31,8 @@ _HEAD: Final = struct.Struct("<qqdqq")
 SIZE_OF_HEAD: Final = _HEAD.size
 _ENDED: Final = 0
 _RECORD: Final = 2
-"""Kinds of states. The C extension makes these; see ``native/states.h``."""
+_SURROGATE: Final = 3
+"""Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
 
 
 class SaveMethod(StrEnum):
@@ -68,6 +70,11 @@ class Head(NamedTuple):
         """Whether the state is the start and the inputs of an episode."""
         return self.kind == _RECORD
 
+    @property
+    def is_of_surrogate(self) -> bool:
+        """Whether the state is that of a surrogate, not of an FMU."""
+        return self.kind == _SURROGATE
+
 
 def head_of(state: bytes) -> Head:
     """Read the head of a state."""
@@ -83,6 +90,11 @@ def outputs_of(state: bytes, count: int) -> tuple[FloatArray, bytes]:
 def ended_state(start_time: float, outputs: FloatArray) -> bytes:
     """The state of an instance that is lost, and could not be stepped any more."""
     return _HEAD.pack(_ENDED, 0, start_time, 0, 0) + outputs.tobytes()
+
+
+def surrogate_state(outputs: FloatArray, content: bytes) -> bytes:
+    """The state of an instance of a surrogate, which no FMU restores."""
+    return _HEAD.pack(_SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from fmugym.baselines.parsing import has_range, search_of
 from fmugym.search.flattening import choices_of
 from fmugym.search.policy import Agent, Policy
 from fmugym.search.probe import Probe
-from fmugym.surrogate.courses import Courses
+from fmugym.surrogate.courses import Course, Courses
 from fmugym.surrogate.surrogate import Surrogate
 from fmugym.surrogate.surrogate_fit import fit
 
@@ -54,13 +54,19 @@ _EPISODES: Final = 8
 """Steps are divided among so many episodes, or more if these are shorter."""
 
 
-def fitted_surrogate(make_env: Callable[[], Any], steps: int, seed: int = 0) -> Surrogate:
+def fitted_surrogate(
+    make_env: Callable[[], Any], steps: int, seed: int = 0, unseen: int = 0
+) -> tuple[Surrogate, list[Course]]:
     """Excite an FMU, and fit a surrogate to what it does.
 
     Args:
         make_env: Makes the environment, in the physical form of its task.
         steps: The steps of the FMU, at most.
         seed: Of episodes and actions.
+        unseen: How many more episodes are played afterwards, for a test. Their steps do not count.
+
+    Returns:
+        The surrogate, and the courses of these episodes.
 
     Raises:
         ConfigError: If no policy can be searched for the task, or its first step always fails.
@@ -78,7 +84,11 @@ def fitted_surrogate(make_env: Callable[[], Any], steps: int, seed: int = 0) -> 
     length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
     with closing(Arena(make_env, _GROUP, length, backend=courses)) as arena:
         excite(arena, courses, probe, (steps - courses.steps) // length, rng)
-    return fit(courses)
+        found, known = fit(courses), len(courses.all())
+        if unseen:
+            arena.most_steps = probe.most_steps
+            excite(arena, courses, probe, unseen, rng)
+    return found, [one for one in courses.all()[known:] if one.steps]
 
 
 def excite(

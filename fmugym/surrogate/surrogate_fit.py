@@ -14,7 +14,7 @@ from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course, Courses
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.surrogate import Surrogate
-from fmugym.surrogate.terms import Form, Terms, rows_of
+from fmugym.surrogate.terms import Form, Terms, rows_of, simulated
 
 __all__ = ["fit"]
 
@@ -215,20 +215,9 @@ def simulation_errors(
     rows = np.stack([rows for rows, _ in windows], axis=1)  # d, windows, steps
     true = np.stack([outputs for _, outputs in windows], axis=1)  # steps, windows, k
     outputs, count = data.widths[0], len(weights)
-    now = np.tile(rows[:, :, 0], count)
-    errors, first = np.zeros((count, outputs)), terms.first_input
-    low, high = data.bounds(terms.form)
-    for step in range(horizon):
-        now[first:] = np.tile(rows[first:, :, step], count)
-        parts = np.split(terms.values(now), count, axis=1)
-        change = np.concatenate(
-            [w.T @ part for w, part in zip(weights, parts, strict=True)], axis=1
-        )
-        after = np.clip(now[:outputs] + change, low[:, None], high[:, None])
-        if terms.form.lags:
-            now[2 * outputs : first] = now[outputs : first - outputs].copy()
-            now[outputs : 2 * outputs] = after - now[:outputs]
-        now[:outputs] = after
-        wrong = (after - np.tile(true[step].T, count)) / data.spread[:, None]
+    errors = np.zeros((count, outputs))
+    simulation = simulated(terms, weights, data.bounds(terms.form), rows)
+    for after, right in zip(simulation, true, strict=True):
+        wrong = (after - np.tile(right.T, count)) / data.spread[:, None]
         errors += np.square(wrong).reshape(outputs, count, -1).mean(axis=2).T
     return np.asarray(np.sqrt(errors.mean(axis=1) / horizon))

@@ -14,6 +14,14 @@ from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.around import play_around
 from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
+from fmugym.pool.bundle import (
+    Bundle,
+    IndexArray,
+    SaveMethod,
+    head_of,
+    outputs_of,
+    surrogate_state,
+)
 from fmugym.pool.health import Column, CountedPool, new_arrays
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.terms import Terms
@@ -60,7 +68,7 @@ class SurrogatePool(CountedPool):
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
         chosen = self._as_mask(mask)
-        starts = values[:, chosen]
+        starts = values[self._places_in(variables)][:, chosen]
         self.outputs[:, chosen] = self._start.outputs(starts)
         self._rows[: self._outputs, chosen] = self.outputs[:, chosen]
         self._rows[self._outputs : self._first_input, chosen] = 0.0
@@ -70,6 +78,18 @@ class SurrogatePool(CountedPool):
         self.statuses[chosen] = Status.OK
         self._counts[chosen, Column.RESETS] += 1
         return self.outputs, self.statuses
+
+    def _places_in(self, variables: tuple[Variable, ...]) -> list[int]:
+        """The places among variables of those that were set in the courses.
+
+        Raises:
+            SimulationError: If others are set, too: nobody knows what they change.
+        """
+        names, known = [one.name for one in variables], self._start.names
+        for name in names:
+            if name not in known:
+                raise SimulationError(f"{name!r} was not set in the episodes of the surrogate")
+        return [names.index(name) for name in known]
 
     def step(
         self,
@@ -130,6 +150,35 @@ class SurrogatePool(CountedPool):
             if one.name not in names:
                 raise SimulationError(f"{one.name!r} cannot be read from a surrogate")
         return self.outputs[[names.index(one.name) for one in variables]]
+
+    # States.
+
+    @property
+    def save_method(self) -> SaveMethod:
+        """See ``Pool.save_method``."""
+        return SaveMethod.STATE
+
+    def save_instances(self, indices: IndexArray) -> Bundle:
+        """See ``Pool.save_instances``."""
+        flags = np.array([self._is_ready, self._is_first], np.float64)
+        contents = np.concatenate([self._rows, flags])[:, indices].T
+        outputs = self.outputs[:, indices].T
+        pairs = zip(outputs, contents, strict=True)
+        return Bundle(tuple(surrogate_state(one, row.tobytes()) for one, row in pairs))
+
+    def restore_instances(
+        self, bundle: Bundle, sources: IndexArray, indices: IndexArray
+    ) -> StatusArray:
+        """See ``Pool.restore_instances``."""
+        for state, index in zip(bundle.states_at(sources), indices.tolist(), strict=True):
+            if not head_of(state).is_of_surrogate:
+                raise SimulationError("the snapshot is of the FMU, not of its surrogate")
+            self.outputs[:, index], content = outputs_of(state, self._outputs)
+            *row, ready, first = np.frombuffer(content).tolist()
+            self._rows[:, index] = row
+            self._is_ready[index], self._is_first[index] = bool(ready), bool(first)
+            self.statuses[index] = Status.OK
+        return self.statuses
 
     def close(self) -> None:
         """See ``Pool.close``."""

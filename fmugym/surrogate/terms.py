@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -13,7 +13,7 @@ from fmugym.expressions.value import Value, where
 from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course
 
-__all__ = ["Form", "Terms", "rows_of"]
+__all__ = ["Form", "Terms", "rows_in", "rows_of", "simulated"]
 
 _BEYOND: Final = 0.2
 """Numbers are clipped to their range in the courses, which is so much wider on both sides."""
@@ -200,3 +200,37 @@ class Terms:
 def rows_in(graph: Graph, name: str, count: int) -> list[Value]:
     """Values that a program reads in so many rows."""
     return [Value.read(graph, name, place) for place in range(count)]
+
+
+def simulated(
+    terms: Terms,
+    weights: Sequence[FloatArray],
+    bounds: tuple[FloatArray, FloatArray],
+    rows: FloatArray,
+) -> Iterator[FloatArray]:
+    """Simulate by numpy, from places in courses on.
+
+    Args:
+        terms: What a step depends on.
+        weights: Sets of weights, each of shape (f, k).
+        bounds: Between what outputs stay, each of shape (k,).
+        rows: As of ``rows_of``, of n simulations, shape (d, n, steps): the first ones tell where
+            they begin, and all tell the inputs.
+
+    Yields:
+        The outputs after each step, shape (k, sets * n).
+    """
+    low, high = bounds
+    outputs, count, first = terms.widths[0], len(weights), terms.first_input
+    now = np.tile(rows[:, :, 0], count)
+    for step in range(rows.shape[2]):
+        now[first:] = np.tile(rows[first:, :, step], count)
+        parts = np.split(terms.values(now), count, axis=1)
+        changes = [one.T @ part for one, part in zip(weights, parts, strict=True)]
+        change = np.concatenate(changes, axis=1)
+        after = np.clip(now[:outputs] + change, low[:, None], high[:, None])
+        if terms.form.lags:
+            now[2 * outputs : first] = now[outputs : first - outputs].copy()
+            now[outputs : 2 * outputs] = after - now[:outputs]
+        now[:outputs] = after
+        yield after

@@ -11,6 +11,7 @@ from typing import Any, Final
 from fmugym.archive.variable import Variable
 from fmugym.baselines import controller_of
 from fmugym.baselines.table_texts import acting_text
+from fmugym.episodes.output_files import require_picture
 from fmugym.episodes.simulation import given_controller
 from fmugym.errors import ConfigError, shown
 from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
@@ -19,9 +20,11 @@ from fmugym.export.exportable import check_name
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.export.names import new_file
 from fmugym.export.surrogates import agent_of_surrogate
+from fmugym.files import replaced
 from fmugym.search.excitation import fitted_surrogate
 from fmugym.search.policy import Agent as FoundAgent
 from fmugym.search.residual import Residual
+from fmugym.surrogate.prediction import plot_prediction, predicted
 from fmugym.tools.options import (
     HELP_OF_TASK,
     Commands,
@@ -39,6 +42,9 @@ __all__ = ["add_export"]
 _ENDINGS: Final = (".c", ".fmu", ".onnx")
 _STEPS: Final = 2000
 """Those of an FMU to which a surrogate is fitted."""
+
+_UNSEEN: Final = 4
+"""Episodes in which the picture of a surrogate compares it with the FMU."""
 
 
 def add_export(commands: Commands) -> None:
@@ -65,6 +71,12 @@ def add_export(commands: Commands) -> None:
     )
     command.add_argument(
         "--steps", type=int, default=_STEPS, help=f"of the FMU, for --surrogate; default {_STEPS}"
+    )
+    command.add_argument(
+        "--plot",
+        type=Path,
+        metavar="FILE",
+        help="with --surrogate, a picture of what it predicts beside the FMU",
     )
     command.add_argument(
         "--output",
@@ -107,6 +119,10 @@ def _export(arguments: argparse.Namespace) -> None:
             f"expected a file that ends in {', '.join(_ENDINGS)}, got {shown(str(output))}"
         )
     new_file(output)
+    if arguments.plot is not None:
+        require_picture(arguments.plot)
+        if not arguments.surrogate:
+            raise ConfigError("--plot shows a surrogate: give --surrogate")
     if arguments.surrogate:
         agent = _surrogate(arguments)
         _show(agent, _written(agent, output, arguments), arguments)
@@ -141,7 +157,12 @@ def _surrogate(arguments: argparse.Namespace) -> Agent:
     check_name(arguments.output.stem)
     with closing(make_env()) as env:
         units = env.fmu.description.units
-    found = fitted_surrogate(make_env, arguments.steps)
+    found, unseen = fitted_surrogate(
+        make_env, arguments.steps, unseen=0 if arguments.plot is None else _UNSEEN
+    )
+    if arguments.plot is not None:
+        with replaced(arguments.plot) as part:
+            plot_prediction(predicted(found, unseen), found).savefig(part)
     tell(
         f"surrogate of {arguments.steps} steps: {found.terms.form}; simulations are wrong by "
         f"{100 * found.error:.2g} % of what outputs vary"

@@ -252,7 +252,10 @@ class Searching:
         return winner
 
     def _proved(self) -> Agent:
-        """Search on a surrogate of the FMU, and find the agent that is best on the FMU."""
+        """Search on a surrogate of the FMU, and find the agent that is best on the FMU.
+
+        What was found is written also if an exception ends the search.
+        """
         left = self.seconds - (monotonic() - self._begin)
         limited = self.minutes is None and self.steps < np.inf
         steps = min(self.steps, _MOST_OF_FMU, left / 2 / self._probe.seconds)
@@ -266,9 +269,11 @@ class Searching:
             self.tell,
             self.advance,
         )
-        winner = twin.winner()
-        self._save(winner)
-        return winner
+        try:
+            return twin.winner()
+        finally:
+            if twin.best is not None:
+                self._save(twin.best)
 
     def _go_on(self) -> None:
         """Go on round by round.

@@ -90,6 +90,7 @@ class TwinSearch:
         rounds: The largest number of rounds.
         tell: Gets lines of text.
         advance: Is told after each round of the seconds since the last one, and of the scores.
+        best: The best agent that the FMU has played until now; None before the first one.
     """
 
     found: Search
@@ -101,6 +102,7 @@ class TwinSearch:
     tell: Callable[[str], None]
     advance: Callable[[float, str], None]
     proofs: list[Proof] = field(default_factory=list)
+    best: Agent | None = None
 
     def __post_init__(self) -> None:
         self._end = monotonic() + self.seconds
@@ -136,10 +138,11 @@ class TwinSearch:
                 )
             self._tell_of(values)
             best = max(range(len(values)), key=lambda place: values[place].merit)
+            winner = self.best = self.proofs[best].agent
             is_over = self._left < 1 or monotonic() > self._end or self.found.rounds >= self.rounds
             if is_over or _is_close(values, best):
                 break
-        return self.proofs[best].agent
+        return winner
 
     # The search on the surrogate.
 

@@ -18,6 +18,7 @@ from fmugym.baselines.observer import spread
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.fmi.status import WARNING_CODE
+from fmugym.surrogate.surrogate_pool import SurrogatePool
 from fmugym.task.future import Future, Lookup, Span
 
 CALM = np.zeros(24)
@@ -315,6 +316,23 @@ class TestModel:
         play(env_of(wheel()), controller, 2)
         assert controller._episodes[0].seen[0, 0] == pytest.approx(0.125, abs=0.02)
 
+    def test_may_be_a_surrogate(self, env_of, bound):
+        """The wheel reaches its speed in four steps, as with copies of the FMU."""
+        controller = bound(model="surrogate", steps=200)
+        actions, rewards = play(env_of(wheel()), controller, 12)
+        assert actions[:3] == pytest.approx(np.ones((3, 1)), abs=0.05)
+        assert np.abs(rewards[4:]).max() < 0.01
+        assert isinstance(controller._copies.inside.pool, SurrogatePool)
+
+    def test_a_surrogate_is_fitted_once_for_an_fmu_and_a_config(self, env_of, bound):
+        controller = bound(model="surrogate", steps=200)
+        surrogates = []
+        for time_step in (None, None, 1200.0):
+            changes = {} if time_step is None else {"time_step": time_step}
+            controller.bind(env_of(wheel(**changes)))
+            surrogates.append(controller._surrogate[1])
+        assert surrogates[0] is surrogates[1] is not surrogates[2]
+
     def test_may_begin_in_the_observed_state(self, env_of, bound):
         """A pendulum swings up that is too heavy to be lifted; its sensors are noisy."""
         task = {
@@ -374,7 +392,9 @@ class TestRefusals:
             ({"perfect": "maybe"}, "perfect must be True or False"),
             ({"budget": 0}, "budget"),
             ({"states": "theta"}, "states must be as in"),
-            ({"model": "house.toml"}, "model must be a function"),
+            ({"model": "house.toml"}, "model must be a function or 'surrogate'"),
+            ({"model": "surrogate", "perfect": True}, "leave out 'model' or 'perfect'"),
+            ({"model": "surrogate", "steps": 0}, "steps must be"),
         ],
     )
     def test_of_arguments(self, arguments, reason):

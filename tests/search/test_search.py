@@ -30,8 +30,9 @@ from fmugym.search.policy import AGENT, LIMIT, Agent, Policy, scale_of
 from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
 from fmugym.surrogate.surrogate_pool import SurrogatePool
-from fmugym.training import searching
+from fmugym.training import searching, twin
 from fmugym.training.searching import Searching
+from fmugym.training.twin import TwinSearch
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 
@@ -1320,6 +1321,27 @@ class TestBudget:
         assert facts["agent"] in facts["test"]
         with pytest.raises(ConfigError, match="no search to resume"):
             searched(folder, resume=True)
+
+    @pytest.mark.parametrize(("cycles", "is_found"), [(0, False), (1, True)])
+    def test_an_interruption_leaves_what_the_fmu_has_played(
+        self, folder, monkeypatch, cycles, is_found
+    ):
+        """Nothing before the first proof on the FMU, and the best one after it."""
+        search = TwinSearch._search
+        monkeypatch.setattr(Probe, "round_time", lambda *_: 1.0)
+        monkeypatch.setattr(twin, "_is_close", lambda *_: False)
+
+        def interrupted(self, arena, cycle):
+            if cycle == cycles:
+                raise KeyboardInterrupt
+            search(self, arena, cycle)
+
+        monkeypatch.setattr(TwinSearch, "_search", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            searched(folder, rounds=np.inf, minutes=0.1)
+        assert folder.exists() == is_found
+        if is_found:
+            assert Agent.load(folder).text
 
 
 HIDDEN = {"q_0": "pi", "theta_0": 0.5, "b": {"distribution": "uniform", "low": 0.1, "high": 1}}

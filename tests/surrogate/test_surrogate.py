@@ -12,6 +12,7 @@ from fmugym.archive.variable import Variable
 from fmugym.envs import HouseEnv, PendulumEnv
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.surrogate.courses import Course, Courses
+from fmugym.surrogate.prediction import predicted
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.surrogate import Surrogate
 from fmugym.surrogate.surrogate_fit import fit
@@ -203,3 +204,77 @@ class TestPool:
                 twin.reset(seed=7)
                 rows.append([twin.step(np.full((2, 1), 0.6, np.float32))[0] for _ in range(30)])
         assert np.array_equal(*rows)
+
+
+class TestStates:
+    def test_an_episode_goes_on_in_another_environment(self, pendulum):
+        """Also one that has not stepped, and with lags."""
+        for make_env, found in ((PendulumEnv, pendulum), (HouseEnv, surrogate_of(HouseEnv, 3, 60))):
+            with closing(FMUVectorEnv(make_env, 3, backend=found)) as envs:
+                action = np.full((3, 1), 0.5, np.float32)
+                for steps in (0, 5):
+                    envs.reset(seed=1)
+                    for _ in range(steps):
+                        envs.step(action)
+                    saved = envs.save_state([2])
+                    expected = [envs.step(action)[:2] for _ in range(10)]
+                    envs.reset(seed=7)
+                    envs.restore_state(saved)
+                    for seen, rewards in expected:
+                        result = envs.step(action)
+                        assert np.array_equal(result.observations, seen[[2, 2, 2]])
+                        assert np.array_equal(result.rewards, rewards[[2, 2, 2]])
+
+    def test_states_of_the_fmu_and_of_the_surrogate_are_told_apart(self, pendulum):
+        with (
+            closing(FMUVectorEnv(PendulumEnv, 1, backend=pendulum)) as twin,
+            closing(FMUVectorEnv(PendulumEnv, 1)) as envs,
+        ):
+            saved = []
+            for one in (twin, envs):
+                one.reset(seed=1)
+                saved.append(one.save_state())
+            with pytest.raises(SimulationError, match="of the FMU, not of its surrogate"):
+                twin.restore_state(saved[1])
+            with pytest.raises(SimulationError):
+                envs.restore_state(saved[0])
+
+    def test_what_was_not_set_in_its_courses_cannot_be_set(self, pendulum):
+        with closing(FMUVectorEnv(PendulumEnv, 1, backend=pendulum)) as envs:
+            envs.reset(seed=1)
+            with pytest.raises(SimulationError, match="'tau'"):
+                envs.reset(options={"model_parameters": {"tau": 1.0}})
+
+
+class TestPrediction:
+    def test_it_is_what_the_pool_does(self):
+        """Of an episode from its beginning on; errors are those of the definition."""
+        found = surrogate_of(PendulumEnv, held=4, steps=100)
+        courses = Courses()
+        rng = np.random.default_rng(3)
+        actions = rng.uniform(-2, 2, (40, 2, 1)).astype(np.float32)
+        outputs = []
+        for backend in (courses, found):
+            with closing(FMUVectorEnv(PendulumEnv, 2, backend=backend)) as envs:
+                envs.reset(seed=5)
+                pool = envs.inside.pool
+                rows = [pool.outputs.copy()]
+                for action in actions:
+                    envs.step(action)
+                    rows.append(pool.outputs.copy())
+                outputs.append(np.array(rows))
+        one, other = courses.all()
+        result = predicted(found, [one, other])
+        begin = one.outputs[:1] - outputs[1][0, :, 0]  # starts are fitted, too
+        assert np.abs(begin).max() < 0.02
+        assert result.course is one
+        assert result.outputs == pytest.approx(outputs[1][:, :, 0], abs=0.3)
+        assert result.errors.shape == (20, 2)
+        last = [
+            simulated(found, Course(c.starts, c.inputs[: b + 20], c.outputs[: b + 21]), b)[-1]
+            - c.outputs[b + 20]
+            for c in (one, other)
+            for b in range(21)
+        ]
+        assert result.errors[-1] == pytest.approx(np.sqrt(np.square(last).mean(axis=0)))
+        assert result.spread == pytest.approx(np.vstack([one.outputs, other.outputs]).std(axis=0))
