@@ -36,8 +36,12 @@ def layers_on(line):
 
 
 LAYERS, CORE = picture()
-EXCEPTIONS = {"fmugym.systems.system": "fmugym.systems.ssp.archives"}
-"""Where the core opens an optional package: ``FMUSystem.read``, of archives that need it."""
+EXCEPTIONS = {
+    "fmugym.systems.system": "fmugym.systems.ssp.archives",
+    "fmugym.baselines.mpc": "fmugym.search.excitation",
+}
+"""Where the core opens an optional package: ``FMUSystem.read``, of archives that need it, and
+``MPC``, whose surrogate comes from an FMU that a controller excites."""
 
 
 def module_of(path):

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
@@ -185,12 +184,12 @@ class MPC(Controller):
 
     def _fitted(self, make: Callable[[], Any]) -> Any:
         """A surrogate of the FMU. One that was fitted to the same FMU and config is kept."""
+        from fmugym.search.excitation import fitted_surrogate  # which needs controllers itself
+
         env: FMUEnv = attribute_of(self._env, "unwrapped")
         scope = scope_of(env)
         if self._surrogate is None or self._surrogate[0] != scope:
-            # The search for policies, which excites the FMU, needs controllers itself.
-            excitation = import_module("fmugym.search.excitation")
-            found, _ = excitation.fitted_surrogate(make, self.steps, self.seed)
+            found, _ = fitted_surrogate(make, self.steps, self.seed)
             env.logger.info(
                 "%s plans on a surrogate of %d steps: %s; simulations are wrong by %.2g %% of what "
                 "outputs vary",
