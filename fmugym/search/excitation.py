@@ -131,11 +131,11 @@ def _excitations(agent: Agent, seed: int) -> Callable[[FloatArray], Any]:
 
 
 def _untuned(agent: Agent) -> Policy:
-    """An agent whose numbers are in the middle of their ranges."""
+    """An agent whose numbers are in the middle of their ranges, and whose weights are 0."""
     if has_range(agent.text):
         middle = np.full(len(search_of(agent.text).ranges), 0.5)
         return agent.with_numbers(middle).policy()
-    return agent.policy() if agent.is_found else Policy(None)
+    return (agent if agent.is_found else agent.with_numbers(np.zeros(agent.size))).policy()
 
 
 class Excitation:

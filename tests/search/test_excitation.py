@@ -15,7 +15,8 @@ from fmugym.surrogate.courses import Courses
 
 def excited(make_env, envs, steps=60, count=7):
     courses = Courses()
-    probe = SimpleNamespace(agents=[Agent("constant action", acting=1)], is_same=False)
+    acting = {PendulumEnv: 1, CartPoleEnv: 2}[make_env]  # two levels
+    probe = SimpleNamespace(agents=[Agent("constant action", acting=acting)], is_same=False)
     with closing(Arena(make_env, envs, steps, backend=courses)) as arena:
         excite(arena, courses, probe, count, np.random.default_rng(5))
         assert arena.steps == courses.steps
