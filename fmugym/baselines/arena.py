@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
+from functools import cached_property
 from time import perf_counter
 from typing import Any, Final, NamedTuple
 
@@ -12,6 +14,7 @@ import numpy as np
 from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.pool.processors import available_processors
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome", "most_steps_of"]
@@ -78,7 +81,8 @@ class Arena:
 
     The environments are made when they are needed, and again when more of them are. Where
     candidates and episodes are too many for them, they play in groups, with the same result. Where
-    they are too few, the other environments rest.
+    they are too few, the other environments rest. FMUs that call Python step in worker processes,
+    unless the config says otherwise.
 
     Attributes:
         make_env: A function that makes the environment, or its class.
@@ -156,8 +160,18 @@ class Arena:
         size = min(jobs, self.most_envs)
         if self._envs is None or self._envs.num_envs < size:
             self.close()
-            self._envs = FMUVectorEnv(self.make_env, size, backend=self.backend)
+            options = self._options if size > 1 else {}
+            self._envs = FMUVectorEnv(self.make_env, size, backend=self.backend, **options)
         return self._envs
+
+    @cached_property
+    def _options(self) -> dict[str, Any]:
+        """Worker processes for an FMU that calls Python, which one process steps one by one."""
+        with closing(self.make_env()) as env:
+            opening = env.inside.opening
+            is_free = opening.backend is None and opening.isolation is None
+            apart = is_free and env.config.isolation is None and env.fmu.calls_python()
+        return {"isolation": "process"} if apart and available_processors() > 1 else {}
 
     def _play(
         self, envs: FMUVectorEnv, controller: Any, seeds: list[int], count: int, has_moments: bool

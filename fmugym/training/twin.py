@@ -40,8 +40,8 @@ _DIVIDED: Final = 16
 """Where they have more than so many, episodes are as long as those of the task."""
 
 _CYCLES: Final = 5
-_FIRST: Final = 120
-_MORE: Final = 40
+_FIRST: Final = 300
+_MORE: Final = 80
 """Rounds of the search until the first proof, and from one proof to the next."""
 
 _CLOSE: Final = 0.2
@@ -155,11 +155,9 @@ class TwinSearch:
         return found
 
     def _arena_on(self, surrogate: Surrogate) -> Arena:
-        """Where the surrogate plays; limits are those of so many steps."""
-        part = self.length / self.found.probe.most_steps
-        limits = {name: part * one for name, one in self.found.probe.limits.items()}
-        self.arena.limits = limits
-        return Arena(self.arena.make_env, _MANY, self.length, limits, backend=surrogate)
+        """Where the surrogate plays, whole episodes."""
+        probe = self.found.probe
+        return Arena(self.arena.make_env, _MANY, probe.most_steps, probe.limits, backend=surrogate)
 
     def _search(self, twin: Arena, cycle: int) -> None:
         found, left = self.found, self._end - monotonic()
@@ -203,12 +201,16 @@ class TwinSearch:
         return [self._value(one, twin) for one in self.proofs]
 
     def _value(self, proof: Proof, twin: Arena) -> Standing:
+        most = twin.most_steps
+        twin.most_steps = self.length
         same = proof.agent.play(twin, proof.seeds)
-        count = 1 if self.found.probe.is_same else _PREDICTED
+        twin.most_steps = most
+        count, times = 1 if self.found.probe.is_same else _PREDICTED, most / self.length
         many = proof.agent.play(twin, range(_TOLD, _TOLD + count))
+        wrong = proof.measured.returns - same.returns, proof.measured.costs - same.costs
         corrected = many._replace(
-            returns=many.returns + (proof.measured.returns - same.returns).mean(),
-            costs=many.costs + (proof.measured.costs - same.costs).mean(axis=1, keepdims=True),
+            returns=many.returns + times * wrong[0].mean(),
+            costs=many.costs + times * wrong[1].mean(axis=1, keepdims=True),
         )
         measured, predicted = (float(one.returns.mean()) for one in (proof.measured, same))
         return Standing(corrected.merits[0], predicted, measured)
