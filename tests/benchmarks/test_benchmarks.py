@@ -129,7 +129,7 @@ def leaves(observations):
     )
 
 
-@pytest.mark.parametrize("index", range(8))
+@pytest.mark.parametrize("index", range(7))
 def test_a_task_by_hand_is_the_same_task(tasks, index):
     task = tasks.TASKS[index]
     envs = fmugym.FMUVectorEnv(task.make, 5, max_episode_steps=60)
@@ -169,7 +169,7 @@ def test_tables_of_the_documentation_have_the_rows_that_stand_there(name):
     assert (result.returncode, result.stderr) == (0, "")
     text = (RUN.parent.parent / DOCUMENTS[name]).read_text(encoding="utf-8")
     written, measured = tables_in(text), tables_in(result.stdout)
-    rows = {"readme": 18, "vector": 5, "hooks": 2, "training": 2, "planning": 5}[
+    rows = {"readme": 17, "vector": 5, "hooks": 2, "training": 2, "planning": 5}[
         name
     ]  # headers, too
     same = [key for key in measured if key in written and not key.startswith(":-")]

@@ -254,7 +254,7 @@ def of_keys() -> Iterator[Mistake]:
             yield task(change, f"'{wrong}'", f"did you mean '{key}'", wrong)
     for key in SECTIONS.keys() - {"class", "arguments", "extends", "system"}:
         wrong = 3.5 if key in _TEXTS_OR_TABLES else [[]]
-        yield task({key: wrong}, key, shown(wrong[0] if key in _TIMES else wrong), WANTED)
+        yield task({key: wrong}, key, shown(wrong[0] if key in _LISTS else wrong), WANTED)
     for key in task_format.CONFIG_OF_TASK.elsewhere:
         yield task(nested(f"config.{key}", 1), f"'{key}' is no key of [config]")
     for key in (field.name for field in fields(EnvConfig) if field.name not in TABLES[""]):
@@ -272,7 +272,7 @@ _TEXTS_OR_TABLES = {
 }
 """Keys that are no numbers."""
 
-_TIMES = ("start_time", "clock")
+_LISTS = ("start_time", "clock", "file")
 """Keys that may be lists, so that their elements are wrong."""
 
 PLACES_OF_NAMES = (
