@@ -20,7 +20,7 @@ from fmugym.errors import ConfigError, shown
 __all__ = ["Tuning", "entrant_of", "numbers_at", "tune"]
 
 _LEAST_CANDIDATES: Final = 8
-_SIGMA: Final = 0.1
+_SIGMA: Final = 0.2
 """Of candidates after the first round, as a part of the ranges, at most."""
 
 
