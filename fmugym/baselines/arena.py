@@ -14,6 +14,7 @@ import numpy as np
 from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.processors import available_processors
 from fmugym.vector import FMUVectorEnv
 
@@ -94,6 +95,8 @@ class Arena:
         ceiling: The largest number of steps.
         longest: The steps of the longest episode until now.
         infos: Those of the last step.
+        jobs: Which job each environment plays, shape (N,), before ``play`` makes a controller; -1
+            for none. Job ``i * k + j`` is episode j of k of candidate i.
         advance: Is told of each step, as a part of all that ``play`` has to do.
         backend: What steps in the place of the FMU; see ``FMUVectorEnv``.
     """
@@ -107,6 +110,7 @@ class Arena:
     seconds: float = 0.0
     ceiling: float = np.inf
     infos: Any = None
+    jobs: IndexArray = field(default_factory=lambda: np.zeros(0, np.int64))
     advance: Callable[[float], None] = lambda part: None
     backend: Any = "auto"
     _envs: FMUVectorEnv | None = None
@@ -141,12 +145,16 @@ class Arena:
         envs, groups = self.open(len(jobs)), []
         self._part = 1 / -(-len(jobs) // envs.num_envs)  # of a group
         for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
-            who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
+            # Places are spread, since neighbours step in the same thread or process.
+            places = np.arange(len(part)) * envs.num_envs // len(part)
+            self.jobs = np.full(envs.num_envs, -1)
+            self.jobs[places] = part
+            who, which = np.divmod(np.maximum(self.jobs, 0), len(seeds))
             controller = make(numbers[who]).bind(envs)
             begin, own = perf_counter(), np.array(seeds)[which].tolist()
-            totals = self._play(envs, controller, own, len(part), has_moments)
+            totals = self._play(envs, controller, own, has_moments)
             self.seconds += perf_counter() - begin
-            groups.append(totals[:, : len(part)])
+            groups.append(totals[:, places])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
         costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
         return Outcome(totals[0], costs, self.limits, moments)
@@ -174,15 +182,21 @@ class Arena:
         return {"isolation": "process"} if apart and available_processors() > 1 else {}
 
     def _play(
-        self, envs: FMUVectorEnv, controller: Any, seeds: list[int], count: int, has_moments: bool
+        self,
+        envs: FMUVectorEnv,
+        controller: Any,
+        seeds: list[int],
+        has_moments: bool,
     ) -> FloatArray:
         """Rewards, costs, faults and moments, summed over an episode, shape (2 + c + r, N).
 
-        Environments from ``count`` on rest, as do those whose episodes have ended.
+        Environments without a job rest, as do those whose episodes have ended.
         """
-        observations, infos = envs.reset(seed=seeds)
+        running = self.jobs >= 0
+        is_first = not envs.inside.episodes.is_ready
+        options = None if is_first or running.all() else {"reset_mask": running.copy()}
+        observations, infos = envs.reset(seed=seeds, options=options)
         totals: FloatArray = np.zeros(())
-        running = np.arange(len(seeds)) < count
         limit = min(self.most_steps, most_steps_of(envs.inside.prototype) or MOST_STEPS)
         left = self._part
         for step in range(self.most_steps):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from typing import Any, Final, Self
 
 import numpy as np
@@ -12,6 +13,7 @@ from gymnasium import spaces
 from fmugym.baselines.arena import Arena
 from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.baselines.parsing import has_range, search_of
+from fmugym.pool.bundle import IndexArray
 from fmugym.search.flattening import choices_of
 from fmugym.search.policy import Agent, Policy
 from fmugym.search.probe import Probe
@@ -107,7 +109,8 @@ def excite(
     for place, agent in enumerate(probe.agents):
         own = seeds[place :: len(probe.agents)]
         if own:
-            made = _excitations(agent, int(rng.integers(_SEEDS)))
+            seed = int(rng.integers(_SEEDS))
+            made = partial(_excitation, arena, agent, seed)
             arena.play(made, np.zeros((1, 1)), own)
     envs = arena.open(1)
     starts = rng.integers(_SEEDS, size=_STARTS)
@@ -118,16 +121,9 @@ def excite(
             return
 
 
-def _excitations(agent: Agent, seed: int) -> Callable[[FloatArray], Any]:
-    """A function that makes the excitations of one group of episodes after another."""
-    first = 0
-
-    def made(rows: FloatArray) -> Excitation:
-        nonlocal first
-        begin, first = first, first + len(rows)
-        return Excitation(_untuned(agent), seed, begin)
-
-    return made
+def _excitation(arena: Arena, agent: Agent, seed: int, rows: FloatArray) -> Any:
+    """The excitation of the episodes that an arena plays next."""
+    return Excitation(_untuned(agent), seed, arena.jobs)
 
 
 def _untuned(agent: Agent) -> Policy:
@@ -144,12 +140,12 @@ class Excitation:
     Args:
         controller: The controller.
         seed: Of the segments.
-        first: The number of the first episode among those with this seed, so that episodes do not
-            depend on how many environments step together.
+        episodes: The number of each environment's episode among those with this seed, shape (N,),
+            so that episodes do not depend on how many environments step together.
     """
 
-    def __init__(self, controller: Controller, seed: int, first: int = 0) -> None:
-        self._controller, self._seed, self._first = controller, seed, first
+    def __init__(self, controller: Controller, seed: int, episodes: IndexArray) -> None:
+        self._controller, self._seed, self._episodes = controller, seed, episodes
 
     def bind(self, env: Any) -> Self:
         """See ``Controller.bind``."""
@@ -163,8 +159,8 @@ class Excitation:
             self._high = self._low + np.asarray(counts) - 1
         else:
             self._low, self._high = space.low, space.high
-        places = range(self._first, self._first + env.num_envs)
-        self._rngs = [np.random.default_rng([self._seed, place]) for place in places]
+        numbers = np.maximum(self._episodes, 0).tolist()
+        self._rngs = [np.random.default_rng([self._seed, number]) for number in numbers]
         self._left = np.zeros(self._shape, int)
         self._kind: Any = np.zeros(self._shape)
         self._value: Any = np.zeros(self._shape)

@@ -178,15 +178,18 @@ def step_test(arena: Arena, limits: Sequence[tuple[float, float]]) -> StepRespon
 def _played(arena: Arena, actions: FloatArray) -> tuple[tuple[str, ...], list[FloatArray]]:
     """Play an episode with each action; returns what is observed, each of shape (T, k)."""
     controllers: list[_Held] = []
+    jobs = []
 
     def make(rows: FloatArray) -> Controller:
         controllers.append(_Held(rows))
+        jobs.append(arena.jobs)
         return controllers[-1]
 
     lengths = arena.play(make, actions, [_SEED], has_moments=True).moments[:, 0, 0]
     longest = max(len(one.rows) for one in controllers)
     rows = np.concatenate([one.course(longest) for one in controllers], axis=1)
-    courses = [rows[: int(length), who] for who, length in enumerate(lengths)]
+    places = np.concatenate(jobs).tolist()
+    courses = [rows[: int(length), places.index(job)] for job, length in enumerate(lengths)]
     return controllers[0].names, courses
 
 
