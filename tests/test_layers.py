@@ -41,7 +41,7 @@ EXCEPTIONS = {
     "fmugym.baselines.mpc": "fmugym.search.excitation",
 }
 """Where the core opens an optional package: ``FMUSystem.read``, of archives that need it, and
-``MPC``, whose surrogate comes from an FMU that a controller excites."""
+``MPC``, whose surrogate comes from an FMU that a controller excites: functions import these."""
 
 
 def module_of(path):
@@ -115,7 +115,7 @@ def test_the_name_of_a_file_tells_it_from_all_others():
 
 
 def test_no_module_imports_itself_by_a_detour():
-    graph = {module: imports_of(module) & MODULES.keys() for module in MODULES}
+    graph = {m: (imports_of(m) & MODULES.keys()) - {EXCEPTIONS.get(m)} for m in MODULES}
     while leaves := {module for module, targets in graph.items() if not targets}:
         graph = {m: targets - leaves for m, targets in graph.items() if m not in leaves}
     assert graph == {}
