@@ -13,6 +13,7 @@ import logging
 import os
 import shlex
 import shutil
+import threading
 import weakref
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -59,6 +60,9 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_PROBE_TIMEOUT: Final = 60.0
 """Seconds that a call may take in the trial of an unknown FMU; for an initialization, ten times."""
+
+_extracting: Final = threading.RLock()
+"""Held while files are extracted: no other thread finds a part of one, or writes it again."""
 
 _NEVER_NEEDED: Final = {"documentation", "sources"}
 _NAMES: Final = {
@@ -407,20 +411,21 @@ class FMU(KnownArguments):
         Raises:
             FMULoadError: If there is no library for this platform or the archive is damaged.
         """
-        if self._folder is not None:
-            self._extract_again(self._folder)
-            return self._folder
-        self._check_library()
-        folder = folder_name()
-        self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
-        try:
-            make_folder(folder)
-            self._extract_to(folder)
-        except BaseException:
-            self.close()
-            raise
-        self._folder = folder
-        return folder
+        with _extracting:
+            if self._folder is not None:
+                self._extract_again(self._folder)
+                return self._folder
+            self._check_library()
+            folder = folder_name()
+            self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
+            try:
+                make_folder(folder)
+                self._extract_to(folder)
+            except BaseException:
+                self.close()
+                raise
+            self._folder = folder
+            return folder
 
     @property
     def is_extracted(self) -> bool:
@@ -553,13 +558,14 @@ def extracted_again(fmu: FMU, copies: int) -> bool:
     Raises:
         FMULoadError: As ``FMU.extract``.
     """
-    before = fmu.extractions
-    if not fmu.is_extracted:
-        return False
-    fmu.extract()
-    if copies:
-        copy_libraries(fmu, copies)
-    return fmu.extractions > before
+    with _extracting:
+        before = fmu.extractions
+        if not fmu.is_extracted:
+            return False
+        fmu.extract()
+        if copies:
+            copy_libraries(fmu, copies)
+        return fmu.extractions > before
 
 
 def _copy_library(fmu: FMU, folder: Path, library: Path, count: int) -> list[Path]:

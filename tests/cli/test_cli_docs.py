@@ -57,7 +57,9 @@ def test_examples_of_commands_run(block, tmp_path, monkeypatch, capsys):
 
 
 def shortened(arguments):
-    """A search of a few rounds instead of a minute."""
+    """A search of a few rounds instead of a minute, and one episode of a planner, not ten."""
+    if arguments[0] == "evaluate" and any("mpc" in one for one in arguments):
+        return [*arguments, "--episodes", "1"]
     is_search = arguments[0] == "train" and "trained" not in arguments
     is_search = is_search and "--algorithm" not in arguments
     return [*arguments, "--rounds", "23", "--episodes", "1"] if is_search else arguments

@@ -60,13 +60,14 @@ def test_a_house_at_rest_loses_what_it_gets(zones, tmp_path):
     assert 15 < two < one < 30
 
 
+@pytest.mark.exhaustive
 def test_train_beats_them(zones, tmp_path):
     """By rounds; a table of controllers that it guesses and tunes does so, too."""
     import zones_figures
 
     path = zones.make_task(tmp_path)
-    hand = zones_figures.by_hand(path, 20)
-    facts, agent, table = zones_figures.trained(path, tmp_path / "agent", episodes=20, rounds=80)
+    hand = zones_figures.by_hand(path, 12)
+    facts, agent, table = zones_figures.trained(path, tmp_path / "agent", episodes=12, rounds=60)
     assert facts["baseline"] == "tuned P"
     for rewards, others in ((table, hand), (agent, table)):
         mean, half = zones_figures.gain(rewards, others)
