@@ -41,6 +41,10 @@ MOST_PROBED: Final = _EPISODES * (_ACTIONS * (_TRIED + _STEPS) + FEW * _TIMED)
 """The steps of a probe, at most. As many count, since how many there are depends on the time."""
 
 
+_TEST_BY_LOOK: Final = 5
+"""The test by which controllers are guessed takes so many times the time of the look."""
+
+
 @dataclass(frozen=True)
 class Probe:
     """What is known of a task.
@@ -87,7 +91,7 @@ class Probe:
             tell: Gets lines about what a user would not expect.
             most: The largest number of steps, without those of the test.
             backend: See ``FMUVectorEnv``.
-            seconds: How long the steps may take.
+            seconds: How long the steps may take, about; those of the test five times as long.
             most_tested: The most steps of the test by which controllers are guessed.
 
         Raises:
@@ -123,6 +127,8 @@ class Probe:
                 arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
                 arena.play(linear, rows, seeds)
             pace, longest = arena.seconds / arena.steps, arena.longest
+            if seconds < np.inf:
+                most_tested = int(min(most_tested, _TEST_BY_LOOK * seconds / max(pace, 1e-9)))
             agents = agents or list(_guessed(arena, loops, tell, most_tested))
         seen = np.dstack([outcome.returns, outcome.moments])
         if np.ptp(outcome.returns) == 0:

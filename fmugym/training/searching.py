@@ -258,7 +258,7 @@ class Searching:
         """
         left = self.seconds - (monotonic() - self._begin)
         limited = self.minutes is None and self.steps < np.inf
-        steps = min(self.steps, _MOST_OF_FMU, left / 2 / self._probe.seconds)
+        steps = min(self.steps, _MOST_OF_FMU, self._before + left / 2 / self._probe.seconds)
         twin = TwinSearch(
             self._found,
             self._arena,
