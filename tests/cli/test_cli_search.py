@@ -322,7 +322,7 @@ CRANE = {
 
 @pytest.mark.parametrize(
     ("task", "rounds", "target"),
-    [("fmugym/CartPole-v0", 50, 475), ("fmugym/CloudPendulum-v0", 100, -95), (CRANE, 150, -75)],
+    [("fmugym/CartPole-v0", 50, 475), ("fmugym/CloudPendulum-v0", 100, -95), (CRANE, 250, -75)],
     ids=["cart-pole", "cloud-pendulum", "crane"],
 )
 def test_targets_are_reached(task, rounds, target, tmp_path, ran):
