@@ -170,12 +170,15 @@ class SurrogatePool(CountedPool):
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> StatusArray:
         """See ``Pool.restore_instances``."""
-        for state, index in zip(bundle.states_at(sources), indices.tolist(), strict=True):
-            if not head_of(state).is_of_surrogate:
-                raise SimulationError("the snapshot is of the FMU, not of its surrogate")
-            self.outputs[:, index], content = outputs_of(state, self._outputs)
-            *row, ready, first = np.frombuffer(content).tolist()
-            self._rows[:, index] = row
+        states = bundle.states_at(sources)
+        if not all(head_of(state).is_of_surrogate for state in states):
+            raise SimulationError("the snapshot is of the FMU, not of its surrogate")
+        parts = [outputs_of(state, self._outputs) for state in states]
+        rows = [np.frombuffer(content) for _, content in parts]
+        if any(len(row) != len(self._rows) + 2 for row in rows):  # with two flags
+            raise SimulationError("the snapshot is of another surrogate")
+        for (outputs, _), (*row, ready, first), index in zip(parts, rows, indices, strict=True):
+            self.outputs[:, index], self._rows[:, index] = outputs, row
             self._is_ready[index], self._is_first[index] = bool(ready), bool(first)
             self.statuses[index] = Status.OK
         return self.statuses

@@ -1,6 +1,7 @@
 """Surrogates: recorded courses, the fit, the programs, and the pool that they step."""
 
 from contextlib import closing
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -206,6 +207,14 @@ class TestPool:
         assert np.array_equal(*rows)
 
 
+def fit_with(terms, surrogate):
+    """A surrogate of other terms, whose weights are 0."""
+    width = (1 + terms.form.lags) * sum(terms.widths)
+    rows = np.random.default_rng(0).normal(size=(width, 9))
+    terms = Terms.of(terms.form, rows, terms.widths)
+    return replace(surrogate, terms=terms, weights=np.zeros((terms.widths[0], terms.count)))
+
+
 class TestStates:
     def test_an_episode_goes_on_in_another_environment(self, pendulum):
         """Also one that has not stepped, and with lags."""
@@ -238,6 +247,21 @@ class TestStates:
                 twin.restore_state(saved[1])
             with pytest.raises(SimulationError):
                 envs.restore_state(saved[0])
+
+    def test_a_state_of_another_surrogate_is_refused(self, pendulum):
+        """And nothing has changed."""
+        terms = replace(pendulum.terms, form=replace(pendulum.terms.form, lags=1))
+        other = fit_with(terms, pendulum)
+        with (
+            closing(FMUVectorEnv(PendulumEnv, 2, backend=pendulum)) as envs,
+            closing(FMUVectorEnv(PendulumEnv, 2, backend=other)) as others,
+        ):
+            envs.reset(seed=1)
+            others.reset(seed=2)
+            kept = envs.inside.pool.outputs.copy()
+            with pytest.raises(SimulationError, match="of another surrogate"):
+                envs.restore_state(others.save_state())
+            assert np.array_equal(envs.inside.pool.outputs, kept)
 
     def test_what_was_not_set_in_its_courses_cannot_be_set(self, pendulum):
         with closing(FMUVectorEnv(PendulumEnv, 1, backend=pendulum)) as envs:
