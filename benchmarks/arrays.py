@@ -51,7 +51,7 @@ def _row(mode: AutoresetMode, size: int, effort: Effort) -> list[str]:
 def _runs(stack: ExitStack, mode: AutoresetMode, size: int) -> Iterator[tuple[str, Run]]:
     env = fmugym.FMUVectorEnv(Endless, size, autoreset_mode=mode)
     stack.callback(env.close)
-    actions, pool, one = env.action_space.sample(), env.inside.pool, env.inside.prototype
+    actions, pool, one = env.action_space.sample(), env.pool, env.prototype
 
     def steps() -> None:
         for _ in range(STEPS):

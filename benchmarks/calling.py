@@ -22,7 +22,7 @@ def in_way(way: str | None, make: Callable[..., FMUEnv]) -> Callable[..., FMUEnv
 
 def _made(way: str | None, make: Callable[..., FMUEnv], *given: Any, **options: Any) -> FMUEnv:
     env = make(*given, **options)
-    assert way != EXPRESSIONS or env.inside.formulas is not None
+    assert way != EXPRESSIONS or env.formulas is not None
     if way not in (None, EXPRESSIONS):
         env.__class__ = _declared(type(env), way == ARRAYS)
     return env
@@ -45,5 +45,5 @@ def _declared(cls: type[FMUEnv], vectorized: bool) -> type[FMUEnv]:
 
 def in_python(env: FMUEnv) -> FMUEnv:
     """Evaluate the expressions of an environment in Python; for the time before its first reset."""
-    env.inside.formulas = None
+    env.formulas = None
     return env

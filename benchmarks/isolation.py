@@ -62,11 +62,9 @@ def _pools(stack: ExitStack, make_env: Callable[[], Any], count: int) -> list[An
     for options in ({"isolation": "none"}, {"isolation": "process", "workers": 1}):
         env = make_with_pool(make_env, count, threads=1, **options)
         stack.callback(env.close)
-        draws = env.inside.draws
-        pools.append(env.inside.pool)
-        env.inside.pool.reset(
-            draws.model_variables, np.repeat(draws.constants[:, None], count, axis=1)
-        )
+        draws = env.episode_start
+        pools.append(env.pool)
+        env.pool.reset(draws.model_variables, np.repeat(draws.constants[:, None], count, axis=1))
     return pools
 
 
@@ -119,7 +117,7 @@ def _after_death(env: Any, measure: Callable[[], float]) -> float:
 
 def _death(env: Any) -> float:
     begin = time.perf_counter()
-    os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+    os.kill(env.pool.processes()[0], signal.SIGKILL)
     while not env.step(0)[3]:
         continue
     return time.perf_counter() - begin
@@ -137,7 +135,7 @@ def _hang(stack: ExitStack) -> float:
     env = make_with_pool(_quiet_env, isolation="process", call_timeout=TIMEOUT)
     stack.callback(env.close)
     env.reset()
-    os.kill(env.inside.pool.processes()[0], signal.SIGSTOP)
+    os.kill(env.pool.processes()[0], signal.SIGSTOP)
     begin = time.perf_counter()
     while not env.step(0)[3]:
         continue

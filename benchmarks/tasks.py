@@ -133,7 +133,7 @@ def _allowed_each(task: Task) -> float | None:
     None if the task has hooks.
     """
     with ExitStack() as stack:
-        engine = _fmugym(stack, task, 1).inside.engine
+        engine = _fmugym(stack, task, 1).engine
     if not engine.has_expressions_only:
         return None
     programs = engine._task

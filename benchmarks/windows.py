@@ -76,9 +76,9 @@ def _pool(stack: ExitStack, path: Path, size: int) -> Any:
         lambda: PushedCartPoleEnv(path), size, isolation="process", workers=1, threads=1
     )
     stack.callback(env.close)
-    draws = env.inside.draws
-    env.inside.pool.reset(draws.model_variables, np.repeat(draws.constants[:, None], size, axis=1))
-    return env.inside.pool
+    draws = env.episode_start
+    env.pool.reset(draws.model_variables, np.repeat(draws.constants[:, None], size, axis=1))
+    return env.pool
 
 
 def _add(table: Table, size: int, pools: list[Any], effort: Effort) -> None:

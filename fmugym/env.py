@@ -29,11 +29,12 @@ from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.beginning import FIRST, BeginningOfOne
 from fmugym.task.construction import Constructed, draws_of_reset, prepare_hooks
+from fmugym.task.episode import Episode
 from fmugym.task.interface import readable_named
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
-from fmugym.task.saving import columns_of, place_columns, require_saving
-from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
+from fmugym.task.saving import columns_of, place_columns, require_saving, scope_of
+from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.specs import EpisodeLimit, limit_of_make
 from fmugym.task.starting import start_time_of
 
@@ -104,6 +105,18 @@ class FMUEnv(Constructed):
         parameters: The parameters of this episode by name.
         variables: The episode variables by name; ``_update`` may write them.
         logger: The logger of the class.
+        interface: The variables of the config, as the FMU has them.
+        pool_spec: The work of the pool at each reset and step: step sizes, variables, solver.
+        pool_opening: Opens pools for this environment.
+        pool: The pool that has the FMU.
+        episode_start: The values with which episodes start, constant or drawn.
+        formulas: The expressions of the task as values of a graph; None without expressions.
+        resolved: The task file, resolved (``TaskEnv``); None for other tasks.
+        step_limit: The number of steps after which an episode is truncated.
+        warm_up: The warm-up with moving inputs; None if there is none.
+        warm_up_steps: The steps of a warm-up.
+        planning_model: Makes an environment to plan with, where a plant stands in for the FMU; or
+            None.
 
     Raises:
         ConfigError: If an argument does not fit, or the config does not fit the FMU.
@@ -150,20 +163,20 @@ class FMUEnv(Constructed):
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
-        self._construct(FMUEnv, fmu_path, config, log_level, render_mode)
+        self._construct(fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
-        if self.inside.formulas is not None:
+        if self.formulas is not None:
             import_module(_COMPILED)  # so that the first reset does not wait for it
 
     # Gymnasium's interface.
 
     def __repr__(self) -> str:
-        if not hasattr(self.inside, "spec"):  # the constructor has not come that far
+        if "pool_spec" not in vars(self):  # the constructor has not come that far
             return object.__repr__(self)
         inputs, outputs = self.config.model_input_names, self.config.model_output_names
         return (
             f"<{type(self).__name__} of {self.fmu.path.name}: {first_of(inputs)} -> "
-            f"{first_of(outputs)} every {self.inside.spec.time_step:g} s>"
+            f"{first_of(outputs)} every {self.pool_spec.time_step:g} s>"
         )
 
     def reset(
@@ -194,24 +207,24 @@ class FMUEnv(Constructed):
                 or the environment is closed.
         """
         check_misplaced(misplaced)
-        pool, inside = self._open_pool("reset"), self.inside
-        if not inside.was_reset:
+        pool = self._open_pool("reset")
+        if not self._was_reset:
             prepare_hooks(self)  # the constructor of the class may have changed the spaces
         seed, draws = check_seed(seed), draws_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
         rng = self.np_random if generator is None else generator
         episode = draws.draw(rng, natively=pool.plays_alone)
-        inside.ended = True  # there is no episode if the FMU fails
+        self._ended = True  # there is no episode if the FMU fails
         try:
             BeginningOfOne(self, draws, episode).begin()
-            inside.was_reset, inside.ended = True, False
+            self._was_reset, self._ended = True, False
             observation, info = first_observation(self)
-            if not inside.has_compiled:
+            if not self._has_compiled:
                 self._compile(pool)
         except BaseException:
-            inside.ended = True
-            inside.halt()
+            self._ended = True
+            self._instance.halt()
             raise
         info["drawn"] = episode.drawn
         if self.render_mode == "human":
@@ -220,10 +233,10 @@ class FMUEnv(Constructed):
 
     def _compile(self, pool: Pool) -> None:
         """Compile the expressions that the hooks are, where a native pool can run them."""
-        own, self.inside.has_compiled = self.inside.own, True
+        own, self._has_compiled = self._own_hooks, True
         is_alone = pool.num_instances == 1 and pool.plays_alone
-        if self.inside.formulas is not None and is_alone and not (own.step or own.reset):
-            self.inside.compiled_step = import_module(_COMPILED).expression_step_of(self)
+        if self.formulas is not None and is_alone and not (own.step or own.reset):
+            self._compiled_step = import_module(_COMPILED).expression_step_of(self)
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
@@ -243,35 +256,33 @@ class FMUEnv(Constructed):
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
                 and, with ``on_fault="raise"``, after a fault.
         """
-        inside = self.inside
-        if inside.ended:
+        if self._ended:
             self._check_before_step()
-        if inside.compiled_step is None or inside.ended:
+        if self._compiled_step is None or self._ended:
             result = self._step_in_python(action)
         else:
-            result = inside.compiled_step.step(self, action)
+            result = self._compiled_step.step(self, action)
         if self.render_mode is not None:
             note_for_picture(self, result[1])
         return result
 
     def _step_in_python(self, action: Any) -> Result:
-        inside = self.inside
         try:
             take_action(self, action)
             try:
-                troubled = inside.step_pool()
-                inside.readings.step_count += 1
-                return judged(self, inside.pool.statuses.item(0) if troubled else 0)
+                self._instance.step()
+                self._episode.step_count += 1
+                return judged(self, self._instance.pool.statuses.item(0))
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
-                inside.ended = True
+                self._ended = True
                 raise
         except BaseException:  # a real system must not go on without its controller
-            inside.halt()
+            self._instance.halt()
             raise
 
     def _check_before_step(self) -> None:
         self._open_pool("step")
-        if not self.inside.was_reset:
+        if not self._was_reset:
             raise SimulationError("step was called before the first reset")
         if not self.steps_after_end:
             raise SimulationError("step was called after the end of the episode; call reset first")
@@ -282,8 +293,8 @@ class FMUEnv(Constructed):
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
-        steps = (self.inside.warm_up_steps + self.step_count) * self.inside.spec.substeps
-        return self.inside.spec.communication_point(steps, start_time_of(self))
+        steps = (self.warm_up_steps + self.step_count) * self.pool_spec.substeps
+        return self.pool_spec.communication_point(steps, start_time_of(self))
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -319,7 +330,7 @@ class FMUEnv(Constructed):
                 for the FMU, or if the FMU fails.
         """
         pool = self._open_pool("save_state")
-        if not self.inside.was_reset:
+        if not self._was_reset:
             raise SimulationError("save_state was called before the first reset")
         bundle = pool.save_instances(FIRST)
         return Snapshot(scope_of(self), columns_of(self), bundle)
@@ -339,15 +350,15 @@ class FMUEnv(Constructed):
         """
         pool = self._open_pool("restore_state")
         columns = checked_snapshot(snapshot, length=1).columns_for(scope_of(self))
-        if not self.inside.was_reset:
+        if not self._was_reset:
             prepare_hooks(self)  # as in ``reset``
         require_saving(pool)
-        self.inside.ended = True  # there is no episode if the FMU fails
+        self._ended = True  # there is no episode if the FMU fails
         if pool.restore_instances(snapshot.bundle, FIRST, FIRST)[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         observation = first_observation(self)[0]
-        if not self.inside.has_compiled:
+        if not self._has_compiled:
             self._compile(pool)
         return observation
 
@@ -356,9 +367,22 @@ class FMUEnv(Constructed):
         args, kwargs = copy.deepcopy(self._constructor_arguments, memo)
         twin = type(self)(*args, **kwargs)
         twin.spec = copy.deepcopy(self.spec, memo)
-        if self.inside.was_reset and self.inside.is_open:
+        if self._was_reset and self._is_open:
             twin.restore_state(self.save_state())
         return twin
+
+    @property
+    def episode(self) -> Episode:
+        """The quantities of the episode, as hooks read them."""
+        return self._episode
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a native pool does the step by programs of the expressions.
+
+        That is known after the first reset.
+        """
+        return self._compiled_step is not None
 
     @property
     def health(self) -> dict[str, int]:
@@ -381,14 +405,14 @@ class FMUEnv(Constructed):
         if type(self)._get_observation is not FMUEnv._get_observation:
             return None
         expressions = tuple(one.text for one in self.config.observations)
-        return expressions or tuple(v.name for v in self.inside.interface.outputs)
+        return expressions or tuple(v.name for v in self.interface.outputs)
 
     @property
     def action_names(self) -> tuple[str, ...] | None:
         """The names of the action's elements; None if a hook of the class makes inputs of it."""
         if type(self)._get_inputs is not FMUEnv._get_inputs:
             return None
-        return tuple(variable.name for variable in self.inside.interface.chosen_inputs)
+        return tuple(variable.name for variable in self.interface.chosen_inputs)
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
@@ -397,7 +421,7 @@ class FMUEnv(Constructed):
         Raises:
             AttributeError: If this is no goal task, as Stable-Baselines3 expects it.
         """
-        if not self.inside.own.goal_reward:
+        if not self._own_hooks.goal_reward:
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
         return lambda one, other, _: self._goal_reward(one, other)
 
@@ -411,7 +435,7 @@ class FMUEnv(Constructed):
             SimulationError: If the environment is closed or was never reset.
         """
         pool = self._open_pool("read_variables")
-        if not self.inside.was_reset:
+        if not self._was_reset:
             raise SimulationError("read_variables was called before the first reset")
         variables = readable_named(self.fmu.description, names)
         values = pool.read(variables)[:, 0].tolist()
@@ -424,16 +448,19 @@ class FMUEnv(Constructed):
 
     def close(self) -> None:
         """Free the FMU and its temporary folder; more than one call is fine."""
-        self.inside.is_closed = True
-        self.inside.close_pool()
-        if self.inside.renderer is not None:
-            self.inside.renderer.close()
-            self.inside.renderer = None
+        self._is_closed = True
+        self._close_pool()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
         super().close()
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
         args, kwargs = self._constructor_arguments
         return _rebuilt, (partial(type(self), *args, **kwargs), self.spec)
+
+
+FMUEnv._base = FMUEnv
 
 
 def _rebuilt(make: Callable[[], FMUEnv], spec: EnvSpec | None) -> FMUEnv:

@@ -103,7 +103,7 @@ def fit_logs(
             initial_states=states,
             fixed={n: v for n, v in plant.given.items() if n not in wanted | states},
             wash_in=wash_in,
-            plant=plant.env.inside.opening,
+            plant=plant.env.pool_opening,
             advance=advance,
         )
         return fit_of(experiment, wanted, trajectories, candidates)
@@ -129,7 +129,7 @@ class _Plant:
 
     def __init__(self, env: Any, columns: dict[str, str]) -> None:
         self.env, self._columns = inner_env(env), columns
-        draws = self.env.inside.draws
+        draws = self.env.episode_start
         typical = np.median(draws.draw_starts(np.random.default_rng(0), 101), axis=1).tolist()
         given = values_by_name(draws.model_variables, typical)
         self.given: dict[str, Any] = {
@@ -138,7 +138,7 @@ class _Plant:
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:
         """The episodes of a log, in the units of the FMU; what was not measured parts them."""
-        spec, columns = self.env.inside.spec, Columns(self.env, log, self._columns)
+        spec, columns = self.env.pool_spec, Columns(self.env, log, self._columns)
         for variable in spec.inputs:
             columns.require(variable)
         measured = [variable for variable in spec.outputs if columns.has(variable)]
@@ -161,7 +161,7 @@ class _Plant:
 
     def require_steps(self, trajectories: Sequence[Trajectory]) -> None:
         """Refuse rows that are no steps apart, if a measured value is that of a whole step."""
-        spec, step = self.env.inside.spec, median_interval(trajectories)
+        spec, step = self.env.pool_spec, median_interval(trajectories)
         whole = [v for v in spec.outputs if v.sampling != "last"]
         sampled = [f"{v.sampling} of {v.name}" for v in whole if v.name in trajectories[0].outputs]
         for one in trajectories if sampled else ():

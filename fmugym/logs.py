@@ -336,12 +336,12 @@ class _Player:
     ) -> None:
         self._recorder = Recorder(env)
         inner: FMUEnv = env.unwrapped
-        if inner.inside.warm_up_steps:
+        if inner.warm_up_steps:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
-        self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
-        self._needed = *inner.inside.spec.outputs, *inner.inside.spec.inputs
+        self._plant, self._log, self._time_step = plant, log, inner.pool_spec.time_step
+        self._needed = *inner.pool_spec.outputs, *inner.pool_spec.inputs
         self._columns = Columns(inner, log, columns)
-        for variable in inner.inside.spec.outputs:
+        for variable in inner.pool_spec.outputs:
             self._columns.require(variable)
         self._actions = Actions(inner, self._columns.range_of, tolerance)
         self._has_drawn_start = inner.config.draws_start_time
@@ -547,9 +547,7 @@ class Actions:
         """
         tried = [self.inputs(action) for action in self._candidates]
         self._find_written(np.array(tried))
-        wanted = np.array(
-            [row[self._env.inside.spec.inputs[place].name] for place in self._written]
-        )
+        wanted = np.array([row[self._env.pool_spec.inputs[place].name] for place in self._written])
         action = self._nearest(np.array(tried), wanted)
         self._require_near(action, wanted, time)
         return action
@@ -559,7 +557,7 @@ class Actions:
         env, before = self._env, self._env.action
         env.action = action
         try:
-            return flat_inputs(self._get_inputs(), env.inside.spec.inputs, shown)
+            return flat_inputs(self._get_inputs(), env.pool_spec.inputs, shown)
         finally:
             env.action = before
 
@@ -568,7 +566,7 @@ class Actions:
         changes = set(np.flatnonzero(np.ptp(tried, axis=0) > 0.0).tolist())
         if changes - set(self._written):
             self._written = sorted(changes.union(self._written))
-            inputs = self._env.inside.spec.inputs
+            inputs = self._env.pool_spec.inputs
             self._scales = np.array([self._range_of(inputs[i]) for i in self._written])
 
     def _nearest(self, tried: FloatArray, wanted: FloatArray) -> Any:
@@ -587,7 +585,7 @@ class Actions:
         off = np.abs(made - wanted) > self._tolerance * self._scales
         if off.any():
             place = int(np.flatnonzero(off)[0])
-            name = self._env.inside.spec.inputs[self._written[place]].name
+            name = self._env.pool_spec.inputs[self._written[place]].name
             raise ConfigError(
                 f"the log at {time:g} s: no action of {self._space} makes {name} = "
                 f"{wanted[place]:g}; the nearest makes {made[place]:g}. If that is near enough, "

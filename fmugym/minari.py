@@ -20,7 +20,8 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
 from fmugym.recording import FACTS, Recording, element_from, flat_element
-from fmugym.task.snapshot import require_scope, scope_of
+from fmugym.task.saving import scope_of
+from fmugym.task.snapshot import require_scope
 
 try:
     import minari

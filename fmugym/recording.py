@@ -34,8 +34,8 @@ from fmugym.checks import check_seed, require_regular
 from fmugym.env import inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.files import replaced
-from fmugym.task.saving import generator_of, row_of, state_of
-from fmugym.task.snapshot import require_scope, scope_of
+from fmugym.task.saving import generator_of, row_of, scope_of, state_of
+from fmugym.task.snapshot import require_scope
 
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
 

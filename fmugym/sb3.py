@@ -125,7 +125,7 @@ class FMUVecEnv(VecEnv):
             The observations; the infos are in ``reset_infos``.
         """
         groups = self._groups_of_options()
-        if len(groups) > 1 and not self.vector_env.inside.episodes.started:
+        if len(groups) > 1 and not self.vector_env.episodes.started:
             self._outer.reset()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for mask, options in groups:
@@ -198,7 +198,7 @@ class FMUVecEnv(VecEnv):
         Raises:
             ConfigError: If there is none of this name (it is an ``AttributeError``, too).
         """
-        read = self.vector_env.inside.attributes.read
+        read = self.vector_env.attributes.read
         require_open(self.vector_env, "get_attr")
         return read(attr_name, self._numbers(indices))
 
@@ -214,7 +214,7 @@ class FMUVecEnv(VecEnv):
             ConfigError: If there is nothing of this name, or it is a parameter that the other
                 environments draw in each episode.
         """
-        attributes = self.vector_env.inside.attributes
+        attributes = self.vector_env.attributes
         given = dict.fromkeys(self._numbers(indices), value)
         if not attributes.is_parameter(attr_name):
             require_open(self.vector_env, "set_attr")
@@ -232,12 +232,12 @@ class FMUVecEnv(VecEnv):
     def _present_values(self, name: str) -> list[Any]:
         if name in self._set_parameters:
             return self._set_parameters[name]
-        env = self.vector_env.inside.prototype
-        if name in env.inside.draws.drawn_names:
+        env = self.vector_env.prototype
+        if name in env.episode_start.drawn_names:
             raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
         variable = env.fmu.variable(name)
         start = variable.start or "" if variable.kind == "string" else variable.start_number
-        return [env.inside.draws.constants_shown.get(name, start)] * self.num_envs
+        return [env.episode_start.constants_shown.get(name, start)] * self.num_envs
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
@@ -251,7 +251,7 @@ class FMUVecEnv(VecEnv):
                 they cannot have each for itself.
         """
         numbers = self._numbers(indices)
-        call = self.vector_env.inside.attributes.call
+        call = self.vector_env.attributes.call
         require_open(self.vector_env, "env_method")
         return call(method_name, numbers, method_args, method_kwargs)
 

@@ -232,7 +232,7 @@ def _require_type(what: str, value: Any, expected: type) -> None:
 def _check_time(env: FMUEnv, actions: list[Any]) -> None:
     with _fresh(env) as tried:
         tried.reset(seed=_SEED)
-        start, step = tried.time, tried.inside.interface.time_step
+        start, step = tried.time, tried.interface.time_step
         for count, action in enumerate(actions, start=1):
             *_, terminated, truncated, _ = tried.step(action)
             expected = start + count * step
@@ -268,7 +268,7 @@ def _check_parameters(env: FMUEnv, actions: list[Any]) -> None:
 
 def _changed(env: FMUEnv, name: str, value: float) -> float | None:
     """Return a value one percent away, in the range of a Real; None for inputs and other types."""
-    if name in env.inside.interface.input_names:
+    if name in env.interface.input_names:
         return None
     variable = env.fmu.variable(name)
     if variable.kind != "real":
@@ -276,7 +276,7 @@ def _changed(env: FMUEnv, name: str, value: float) -> float | None:
     nominal = abs(value) or abs(variable.nominal or 1.0)
     for candidate in (value + 0.01 * nominal, value - 0.01 * nominal):
         with suppress(ConfigError):
-            env.inside.interface.within(variable, candidate)
+            env.interface.within(variable, candidate)
             return candidate
     return None
 

@@ -106,6 +106,13 @@ WIDE static void count_steps(const Play *play, size_t begin, size_t count) {
     }
 }
 
+static void copy_rows(const RowCopies *copies, size_t begin, size_t count) {
+    for (size_t i = 0; i < copies->count; i++) {
+        const Row *from = &copies->rows[i].from, *to = &copies->rows[i].to;
+        memcpy(to->data + begin * to->size, from->data + begin * from->size, count * to->size);
+    }
+}
+
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch) {
     const Play *play = turn->play;
     Notes notes = {.outside = false};
@@ -113,6 +120,7 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     if (play->actions.current != NULL) {
         take_actions(turn, begin, count);
     }
+    copy_rows(&play->before_inputs, begin, count);
     const Source source = source_of(turn);
     program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
     if (play->reads_kept) {
@@ -172,6 +180,9 @@ static void start_listed(const Turn *turn, const uint32_t *starting, size_t coun
     }
     start_inputs(play, starting, count);
     start_variables(turn, starting, count);
+    for (size_t j = 0; j < count; j++) {
+        copy_rows(&play->before_inputs, starting[j], 1);
+    }
     for (size_t i = 0; i < play->number_of_outputs; i++) {
         const double *from = play->output_rows + i * play->count;
         double *to = play->kept_rows + i * play->count;
@@ -209,13 +220,6 @@ void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
         }
     }
     start_listed(turn, starting, number);
-}
-
-static void copy_rows(const Play *play, size_t begin, size_t count) {
-    for (size_t i = 0; i < play->number_of_copies; i++) {
-        const Row *from = &play->copies[i].from, *to = &play->copies[i].to;
-        memcpy(to->data + begin * to->size, from->data + begin * from->size, count * to->size);
-    }
 }
 
 /* Avoids branches, because the processor could not predict them. Handles the wide values first,
@@ -272,7 +276,7 @@ void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh
     Notes notes = {.outside = false};
 
     source.fresh = fresh;
-    copy_rows(play, begin, count);
+    copy_rows(&play->before_judgement, begin, count);
     program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
     add_notes(&notes, count, verdict);
@@ -289,7 +293,7 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     uint8_t *ended = play->ended + begin, before[PROGRAM_WIDTH];
     Notes notes = {.outside = false};
 
-    copy_rows(play, begin, count);
+    copy_rows(&play->before_judgement, begin, count);
     memcpy(before, ended, count);
     memset(ended, 1, count);
     program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);

@@ -33,10 +33,15 @@ typedef struct {
     double value;
 } InputStart;
 
-/* Keeps a row of episode variables as it was before the step. */
+/* Keeps a row as it was before the step. */
 typedef struct {
     Row from, to;
 } RowCopy;
+
+typedef struct {
+    const RowCopy *rows;
+    size_t count;
+} RowCopies;
 
 /* The value of an episode variable at the start of an episode, unless it is drawn. */
 typedef struct {
@@ -64,8 +69,8 @@ typedef struct {
     double *kept_rows; /* the outputs before the step */
     size_t number_of_outputs;
     bool reads_kept; /* whether the judgement reads them */
-    const RowCopy *copies;
-    size_t number_of_copies;
+    RowCopies before_inputs;    /* what the program of the inputs is going to replace */
+    RowCopies before_judgement; /* the episode variables */
     const VariableStart *variable_starts;
     size_t number_of_variable_starts;
     const DrawnVariable *drawn_variables;

@@ -43,18 +43,18 @@ static void read_actions(Reader *reader, PlayForm *p) {
     a->none = none.bytes;
 }
 
-static void read_copies(Reader *reader, PlayForm *p, const Rows *rows) {
+static RowCopies read_copies(Reader *reader, RowCopy **memory, const Rows *rows) {
     size_t count;
     const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
+    RowCopy *copies = *memory = room_for(reader, count, sizeof *copies);
 
-    p->play.copies = p->copies = room_for(reader, count, sizeof *p->copies);
-    p->play.number_of_copies = count;
     for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
-        p->copies[i] = (RowCopy){row_of(reader, rows, pairs[0]), row_of(reader, rows, pairs[1])};
-        if (p->copies[i].from.size != p->copies[i].to.size) {
+        copies[i] = (RowCopy){row_of(reader, rows, pairs[0]), row_of(reader, rows, pairs[1])};
+        if (copies[i].from.size != copies[i].to.size) {
             reader_refuse(reader, "rows to copy differ in type");
         }
     }
+    return (RowCopies){copies, count};
 }
 
 /* A row and the bits of a value. */
@@ -138,7 +138,8 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
     p->play.reads_kept = read_flag(&reader);
     p->play.limit = read_integer(&reader);
     read_actions(&reader, p);
-    read_copies(&reader, p, &all);
+    p->play.before_inputs = read_copies(&reader, &p->before_inputs, &all);
+    p->play.before_judgement = read_copies(&reader, &p->before_judgement, &all);
     read_variable_starts(&reader, p, &all);
     read_drawn_variables(&reader, p, &all);
     read_input_starts(&reader, p);
@@ -183,7 +184,8 @@ void play_settle(PlayForm *p, const Settings *s, double *inputs, double *kept,
 void play_drop(PlayForm *p) {
     program_drop(&p->inputs);
     program_drop(&p->judgement);
-    free(p->copies);
+    free(p->before_inputs);
+    free(p->before_judgement);
     free(p->variable_starts);
     free(p->drawn_variables);
     free(p->input_starts);

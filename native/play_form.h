@@ -11,7 +11,7 @@ typedef struct {
     ProgramForm inputs, judgement;
     bool keeps_actions; /* whether hooks read the actions of this step or of the one before */
     char *form;         /* a copy of it, which the play points to */
-    RowCopy *copies;
+    RowCopy *before_inputs, *before_judgement;
     VariableStart *variable_starts;
     DrawnVariable *drawn_variables;
     InputStart *input_starts;

@@ -265,7 +265,7 @@ class TestFitted:
 
     def test_rows_are_drawn_whole_by_all_environments(self, document, make_envs):
         with fmugym.load(document) as env:
-            assert env.inside.draws.recipes[-1].kind == "same_row"
+            assert env.episode_start.recipes[-1].kind == "same_row"
             single = [drawn(env, seed) for seed in range(20)]
         assert all(one["c"] == pytest.approx(0.5 * one["l"], rel=1e-12) for one in single)
         assert len({one["l"] for one in single}) > 10
@@ -289,7 +289,7 @@ class TestFitted:
 
         document["parameters"] = {"b": Own()}
         with fmugym.load(document) as env:
-            assert env.inside.draws.recipes is None
+            assert env.episode_start.recipes is None
             values = drawn(env, 3)
             again = env.reset(seed=3, options={"model_parameters": {"l": 0.1}})[1]["drawn"]
         assert values["c"] == pytest.approx(0.5 * values["l"], rel=1e-12)
@@ -347,9 +347,9 @@ def test_logs_fit_any_environment():
             rows.append(plant.state)
             if plant.done:
                 break
-        names = [variable.name for variable in plant.inside.spec.outputs]
+        names = [variable.name for variable in plant.pool_spec.outputs]
         written = np.array([10.0 if one else -10.0 for one in inputs[: len(rows) - 1]])
-        step = plant.inside.spec.time_step
+        step = plant.pool_spec.time_step
     columns = dict(zip(names, np.array(rows).T, strict=True))
     columns["f"] = np.append(written, 0.0)
     log = PlantLog(step * np.arange(len(rows)), columns, {}, np.zeros(len(rows)))

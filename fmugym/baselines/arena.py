@@ -176,7 +176,7 @@ class Arena:
     def _options(self) -> dict[str, Any]:
         """Worker processes for an FMU that calls Python, which one process steps one by one."""
         with closing(self.make_env()) as env:
-            opening = env.inside.opening
+            opening = env.pool_opening
             is_free = opening.backend is None and opening.isolation is None
             apart = is_free and env.config.isolation is None and env.fmu.calls_python()
         return {"isolation": "process"} if apart and available_processors() > 1 else {}
@@ -193,11 +193,11 @@ class Arena:
         Environments without a job rest, as do those whose episodes have ended.
         """
         running = self.jobs >= 0
-        is_first = not envs.inside.episodes.is_ready
+        is_first = not envs.episodes.is_ready
         options = None if is_first or running.all() else {"reset_mask": running.copy()}
         observations, infos = envs.reset(seed=seeds, options=options)
         totals: FloatArray = np.zeros(())
-        limit = min(self.most_steps, most_steps_of(envs.inside.prototype) or MOST_STEPS)
+        limit = min(self.most_steps, most_steps_of(envs.prototype) or MOST_STEPS)
         left = self._part
         for step in range(self.most_steps):
             count = int(np.count_nonzero(running))

@@ -350,4 +350,4 @@ def attribute_of(env: Any, name: str) -> Any:
     """An attribute of an environment, or of the first of many."""
     base: Any = env.unwrapped
     is_vector = isinstance(base, VectorEnv)
-    return getattr(base.inside.prototype if is_vector else base, name)
+    return getattr(base.prototype if is_vector else base, name)

@@ -29,8 +29,9 @@ from fmugym.checks import (
 )
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.task.future import Future
-from fmugym.task.snapshot import Snapshot, scope_of
+from fmugym.task.future import Future, future_of
+from fmugym.task.saving import scope_of
+from fmugym.task.snapshot import Snapshot
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["MPC"]
@@ -163,8 +164,8 @@ class MPC(Controller):
         self._copies = FMUVectorEnv(
             partial(_that_goes_on, make), self._many, autoreset_mode="Disabled", backend=backend
         )
-        self._prototype = self._copies.inside.prototype
-        future = self._prototype.inside.future or Future({}, (), float)
+        self._prototype = self._copies.prototype
+        future = future_of(self._prototype) or Future({}, (), float)
         for name in self.states:
             self._check_name("states", name)
         self._places = list(map(self._place_of, self.states))
@@ -206,9 +207,9 @@ class MPC(Controller):
         if callable(self.model):
             return self.model
         env: FMUEnv = attribute_of(self._env, "unwrapped")
-        if env.inside.model is not None:
-            return env.inside.model
-        if env.inside.pool.save_method is None:
+        if env.planning_model is not None:
+            return env.planning_model
+        if env.pool.save_method is None:
             raise ConfigError(
                 "MPC needs an FMU that it can copy, but a backend stands in for this one: give "
                 "'model', a function that makes the environment to plan with"
@@ -241,7 +242,8 @@ class MPC(Controller):
         """The simple controllers, bound to the copies."""
         if self.warm is not None:
             return [self.warm.bind(self._copies, self.names)]
-        declared = self._prototype.inside.controllers or list
+        resolved = self._prototype.resolved
+        declared = list if resolved is None else resolved.controllers
         return [one for one in declared() if self._fits(one)]
 
     def _fits(self, controller: Controller) -> bool:
@@ -264,11 +266,9 @@ class MPC(Controller):
 
     def _decide_one(self, index: int, row: FloatArray) -> FloatArray:
         begin = perf_counter()
-        single = (
-            self._env.inside.engine.single(index) if self._is_vector else nullcontext(self._env)
-        )
+        single = self._env.engine.single(index) if self._is_vector else nullcontext(self._env)
         with single as env:
-            future = env.inside.future
+            future = future_of(env)
             now = 0.0 if future is None else float(future.clock(env))
             known = self._episodes[index]
             episode = self._episodes[index] = known or self._begun(env)
@@ -277,7 +277,7 @@ class MPC(Controller):
                 self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
-        with self._copies.inside.episodes.assuming(data):
+        with self._copies.episodes.assuming(data):
             best = self._search(episode, start, assumed, row)
         episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
         for name, paid in best.costs.items():
@@ -307,9 +307,10 @@ class MPC(Controller):
             given = {name: float(each[place]) for name, each in values.items()}
             options |= {"model_parameters": given} if given else {}
             observations, _ = copied.reset(seed=self.seed, options=options)
-        keys = () if env.inside.future is None else env.inside.future.keys
+        future = future_of(env)
+        keys = () if future is None else future.keys
         known = self._prototype.variables.keys() - keys
-        copied.inside.engine.show(
+        copied.engine.show(
             {n: float(v) for n, v in env.variables.items() if np.ndim(v) == 0 and n in known}, {}
         )
         episode.seen = np.asarray(observations, np.float64)
@@ -325,7 +326,7 @@ class MPC(Controller):
 
     def _measured(self, env: FMUEnv) -> npt.NDArray[np.bool_]:
         """Which elements of the observation were measured now, and do not hold or lie ahead."""
-        is_held = np.isin([*self._prototype.out], [*env.inside.held()])
+        is_held = np.isin([*self._prototype.out], [*env.held_outputs()])
         return np.asarray(self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1))
 
     def _follow(self, episode: _Episode, action: Any, row: FloatArray, now: float) -> None:
@@ -334,7 +335,7 @@ class MPC(Controller):
             return
         copied = self._copies
         data = self._foresight.observed(episode.row, row, now)
-        with copied.inside.episodes.assuming(data):
+        with copied.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
             actions = np.repeat(np.asarray(action)[np.newaxis], self._many, axis=0)
             observations, _, terminated, truncated, _ = copied.step(actions)
@@ -358,7 +359,7 @@ class MPC(Controller):
         seen = partial(copied.rollout, snapshot, action[:, :1])
         plain = seen().observations[0, 0].astype(np.float64)
         columns = []
-        for name in copied.inside.prototype.out:
+        for name in copied.prototype.out:
             change = seen(offsets={name: 1.0}).observations[0, 0] - plain
             columns.append(np.where(self._foresight.is_present, change, 0.0))
         slopes = np.array(columns).T
@@ -458,7 +459,7 @@ class MPC(Controller):
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
         """What costs may add up to until the horizon, from what the episode has left of them."""
-        steps, limit = self._plan_shape[0], self._prototype.inside.step_limit
+        steps, limit = self._plan_shape[0], self._prototype.step_limit
         left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
             name: max(0.0, most - episode.costs.get(name, 0.0)) * min(1.0, steps / left)

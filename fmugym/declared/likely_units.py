@@ -254,7 +254,7 @@ def misreadings(env: Any, seen: Mapping[str, Sequence[float]]) -> Iterator[Misre
         seen: Finite values of outputs by the names of the task, in its units.
     """
     given = env.task.document.get("variables") or {}
-    for quantity in env.inside.quantities().all:
+    for quantity in env.resolved.quantities().all:
         declared = given.get(quantity.name, {})
         variable = _without_unit(env, declared.get("name", quantity.name))
         if quantity.kind not in _KINDS or variable is None or declared.get("sample") == "integral":
@@ -290,7 +290,7 @@ def require_units(env: Any) -> None:
     if getattr(env, "task", None) is None or not any(_open_names(env)):
         return
     env.reset(seed=0)
-    quantities = env.inside.quantities()
+    quantities = env.resolved.quantities()
     pairs = zip(quantities.all, quantities.read(env), strict=True)
     seen = {one.name: finite_values([value]) for one, value in pairs}
     for one in misreadings(env, seen):

@@ -175,7 +175,7 @@ class DeclaredWarmUp(WarmUp):
 
     def inputs(self, env: Any) -> Any:
         """See ``WarmUp.inputs``; the controllers act first."""
-        env.previous_action, env.action = env.action, np.array(env.action)
+        env.action = np.array(env.action)
         chosen = {} if self._pilot is None else self._pilot.act(env)
         for place, value in chosen.items():
             env.action[place if env.action.ndim > 1 else ...] = value

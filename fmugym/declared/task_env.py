@@ -67,9 +67,8 @@ class TaskEnv(FMUEnv):
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         with root.placing():
             resolved = ResolvedTask(self.task, root, description, needs_reward)
-        self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
-        self.inside.controllers = resolved.controllers
-        self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
+        self.resolved = resolved
+        self.cost_limits, self.warm_up = resolved.cost_limits, resolved.warm_up
         self.unphysical_keys, self.expressions = resolved.unphysical_keys, resolved.expressions
         if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
             raise self.task.root.child("warm_up").error(
@@ -83,7 +82,7 @@ class TaskEnv(FMUEnv):
         for name, function in resolved.hooks.items():
             if name not in own:
                 setattr(self, name, MethodType(function, self))
-        self.inside.formulas = resolved.formulas
+        self.formulas = resolved.formulas
         with self.task.root.placing():
             super().__init__(
                 source,

@@ -74,6 +74,6 @@ def _variable(name: str, series: Any, env: FMUEnv) -> Variable:
         "unit": series.unit,
         "description": f"{name} of the task",
     }
-    own, taken = identifier(name), env.inside.interface.input_names
+    own, taken = identifier(name), env.interface.input_names
     kind = "Float64" if env.fmu.description.fmi_version.startswith("3") else "Real"
     return Variable(f"{own}_given" if own in taken else own, kind, **facts)

@@ -42,7 +42,7 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
         if not name.startswith("_"):
             vars(other).setdefault(name, value)
     # the first sample is taken when the warm-up is over
-    other.inside.warm_up_steps = env.inside.warm_up_steps
+    other.warm_up_steps = env.warm_up_steps
     with closing(other):
         yield other
 

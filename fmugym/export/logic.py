@@ -27,7 +27,8 @@ from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.graph import Graph, Node
 from fmugym.expressions.program import UncompilableError
 from fmugym.expressions.value import Value
-from fmugym.task.inside import is_overridden
+from fmugym.task.actions import no_action
+from fmugym.task.own_hooks import is_overridden
 from fmugym.vector.hooks.formula_programs import Translation, written_variables
 
 __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
@@ -140,9 +141,9 @@ def logic_of(
 def _logic_of_ideal(
     env: FMUEnv, decision: Decision, all_inputs: bool, external: Collection[str]
 ) -> Logic:
-    if env.inside.own.step or env.inside.own.reset:
-        name = "step" if env.inside.own.step else "reset"
-        raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
+    for name in ("step", "reset"):
+        if is_overridden(env, name):
+            raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
     if not isinstance(env.action_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete):
         raise ConfigError(
             "an agent with a Box, Discrete or MultiDiscrete of actions can be exported, got "
@@ -170,12 +171,12 @@ def _formulas_of(env: FMUEnv) -> Formulas:
         ConfigError: If a hook is a function of Python.
     """
     for hook, key in _KEYS.items():
-        if is_overridden(env, env.inside.base, hook):
+        if is_overridden(env, hook):
             raise ConfigError(
                 f"{type(env).__name__} cannot be exported: its hook {hook} is a function of "
                 f"Python; write expressions under the key {key!r} instead"
             )
-    return env.inside.formulas or Formulas(Graph(), None, (), None, None, None, None, {})
+    return env.formulas or Formulas(Graph(), None, (), None, None, None, None, {})
 
 
 class _Sample:
@@ -282,11 +283,11 @@ class _Assembly:
     ) -> None:
         self._env, self._sample, self._graph = env, sample, sample.graph
         rng = np.random.default_rng(_SEED)
-        self._episode = env.inside.draws.draw(rng)
+        self._episode = env.episode_start.draw(rng)
         self._starts = {**self._episode.variables, **decision.starts}
-        self._drawn = set(env.inside.draws.drawn_names)
+        self._drawn = set(env.episode_start.drawn_names)
         self._external = found_in(env, external, self._graph, sample.observation)
-        rows = zip(env.inside.interface.inputs, sample.inputs, sample.are_chosen, strict=True)
+        rows = zip(env.interface.inputs, sample.inputs, sample.are_chosen, strict=True)
         self._inputs = [
             (variable, node) for variable, node, is_chosen in rows if all_inputs or is_chosen
         ]
@@ -311,7 +312,7 @@ class _Assembly:
         updates = (node for kept in self._kept for node in kept.updates)
         numbers = sorted(needed.union(updates))
         loads = {n: load for n in numbers if (load := self._load(n, places)) is not None}
-        interface = self._env.inside.interface
+        interface = self._env.interface
         outputs = interface.outputs + interface.monitors
         return Logic(
             self._graph,
@@ -348,7 +349,7 @@ class _Assembly:
         """The places of the values that are measured now, or were at the sample before."""
         reads = self._reads(needed)
         places = sorted({place for (place,) in (*reads["output"], *reads["kept"])})
-        interface = self._env.inside.interface
+        interface = self._env.interface
         for place in places:
             variable = (interface.outputs + interface.monitors)[place]
             if variable.causality != "output":
@@ -383,14 +384,14 @@ class _Assembly:
 
     def _first_inputs(self) -> list[float]:
         given = self._episode.parameters
-        for name, _ in self._env.inside.start_inputs:
+        for name, _ in self._env.interface.start_inputs:
             if name in self._drawn:
                 raise UncompilableError(f"it reads the input {name!r}, whose first value is drawn")
-        return [float(given.get(name, start)) for name, start in self._env.inside.start_inputs]
+        return [float(given.get(name, start)) for name, start in self._env.interface.start_inputs]
 
     def _add_actions(self, has_older: bool) -> None:
         space: Any = self._env.action_space
-        dtype, first = np.dtype(space.dtype), np.ravel(self._env.inside.no_action)
+        dtype, first = np.dtype(space.dtype), np.ravel(no_action(space))
         self._add("action", dtype, first.tolist(), self._sample.action)
         if has_older:
             last = [self._graph.load("action", i, dtype) for i in range(len(first))]
@@ -404,7 +405,7 @@ class _Assembly:
 
     def _add_parameter(self, name: str) -> None:
         own = self._episode.parameters[name]
-        value, variable = np.ravel(own), self._env.inside.interface.parameter(name, own)
+        value, variable = np.ravel(own), self._env.interface.parameter(name, own)
         self._add(name, np.dtype(np.float64), value.tolist(), ())
         self._note_parameters(name, value, variable)
 

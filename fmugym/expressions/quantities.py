@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-__all__ = ["KEPT", "QUANTITIES", "EpisodeQuantity"]
+__all__ = ["KEPT", "PREVIOUS", "QUANTITIES", "EpisodeQuantity"]
 
 _FLOAT: Final = np.dtype(np.float64)
 _COUNT: Final = np.dtype(np.int64)
@@ -25,7 +25,7 @@ class EpisodeQuantity(NamedTuple):
 
     Attributes:
         name: Its name in graphs; keys may follow, such as the place of an output.
-        attribute: The attribute of an environment and of ``Readings`` that has it.
+        attribute: The attribute of an environment and of ``Episode`` that has it.
         shape: One value for each of the ``"outputs"`` and monitored variables, of the ``"states"``
             (the outputs only) or of the ``"inputs"``; the shape of an ``"action"``; a
             ``"number"``; values that are ``"named"``; ``"derived"`` if it follows from others.
@@ -33,6 +33,8 @@ class EpisodeQuantity(NamedTuple):
         before: The kind of the rows that a program loads before the FMU's step; None if there are
             none.
         after: The same after the FMU's step.
+        of: The attribute whose value before the step it has.
+        array: The attribute of a pool that is its array; "" if it has one of its own.
     """
 
     name: str
@@ -41,21 +43,32 @@ class EpisodeQuantity(NamedTuple):
     dtype: np.dtype[Any] = _FLOAT
     before: str | None = None
     after: str | None = None
+    of: str = ""
+    array: str = ""
+
+    @property
+    def zero(self) -> Any:
+        """Zero in its type."""
+        return self.dtype.type().item()
 
     @property
     def in_hooks(self) -> str:
         """Where functions of an environment find it."""
-        return "inside.readings.outputs" if self.name == "outputs" else self.attribute
+        return "_episode.outputs" if self.name == "outputs" else self.attribute
 
 
 QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
     one.name: one
     for one in (
-        EpisodeQuantity("outputs", "outputs", "outputs", _FLOAT, "output", "output"),
-        EpisodeQuantity("previous_outputs", "previous_state", "states", _FLOAT, "output", "kept"),
-        EpisodeQuantity("inputs", "inputs", "inputs", _FLOAT, "input", "input"),
+        EpisodeQuantity(
+            "outputs", "outputs", "outputs", _FLOAT, "output", "output", array="outputs"
+        ),
+        EpisodeQuantity(
+            "previous_outputs", "previous_state", "states", _FLOAT, "output", "kept", of="state"
+        ),
+        EpisodeQuantity("inputs", "inputs", "inputs", _FLOAT, "input", "input", array="inputs"),
         EpisodeQuantity("action", "action", "action"),
-        EpisodeQuantity("previous_action", "previous_action", "action"),
+        EpisodeQuantity("previous_action", "previous_action", "action", of="action"),
         EpisodeQuantity("step_count", "step_count", "number", _COUNT, "step_count", "step_count"),
         EpisodeQuantity("time", "time", "derived"),
         EpisodeQuantity("done", "done", "number", _FLAG),
@@ -69,3 +82,6 @@ once they have found it, and run no step after the end of an episode."""
 
 KEPT: Final = tuple(one for one in QUANTITIES.values() if one.shape not in {"named", "derived"})
 """The quantities that are kept as numbers or arrays, in the order of columns of snapshots."""
+
+PREVIOUS: Final = {one.attribute: one.of for one in KEPT if one.of}
+"""By attribute, the attribute whose value before the step it has."""

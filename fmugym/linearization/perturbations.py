@@ -84,7 +84,7 @@ def differentiate_by_starts(
     Raises:
         SimulationError: See ``linearize_along``.
     """
-    episodes = envs.inside.episodes
+    episodes = envs.episodes
     with episodes.returning_to(envs.save_state() if episodes.is_ready else None):
         return _Perturbation(envs, states, start).differentiate(nominal, steps)
 
@@ -93,12 +93,12 @@ class _Perturbation:
     """Plays a trajectory, and single steps beside it."""
 
     def __init__(self, envs: FMUVectorEnv, states: Mapping[str, str], start: Snapshot) -> None:
-        env, inside = envs.inside.prototype, envs.inside
-        self._engine, self._pool, self._episodes = inside.engine, inside.pool, inside.episodes
-        self._spec = env.inside.spec
+        env = envs.prototype
+        self._engine, self._pool, self._episodes = envs.engine, envs.pool, envs.episodes
+        self._spec = env.pool_spec
         self._space = float_box(envs.single_action_space, "action")
         self._x = tuple(map(env.fmu.variable, states))
-        self._count_of_y = env.inside.output_count
+        self._count_of_y = env.interface.output_count
         self._start = start
         self._times: FloatArray = np.empty(0)
         self._everywhere = np.arange(envs.num_envs)
@@ -107,7 +107,7 @@ class _Perturbation:
             for name, column in self._episodes.columns_of(start)["parameters"].items()
             if column[0] is not None and name not in {*states.values(), START_TIME.name}
         }
-        fixed = [env.inside.interface.parameter(name, value) for name, value in given.items()]
+        fixed = [env.interface.parameter(name, value) for name, value in given.items()]
         pairs = zip(fixed, given.values(), strict=True)
         self._fixed = np.array([checked_value(variable, value) for variable, value in pairs])
         self._variables = (*fixed, *map(env.fmu.variable, states.values()), START_TIME)

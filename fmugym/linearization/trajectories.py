@@ -25,6 +25,8 @@ from fmugym.linearization.sensitivities import (
     require_vector,
 )
 from fmugym.pool.base import FloatArray
+from fmugym.task.actions import written_inputs
+from fmugym.task.episode import standing_in
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.starting import start_variable
 from fmugym.vector.vector_env import FMUVectorEnv
@@ -126,10 +128,10 @@ def linearize_along(
             do not determine what follows.
     """
     require_vector(envs, "linearize_along")
-    env = envs.inside.prototype
+    env = envs.prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)
-    start = envs.inside.episodes.start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
+    start = envs.episodes.start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
     chosen = _states(env, states)
     if method is not None:
         check_option("method", method, _METHODS)
@@ -163,7 +165,7 @@ def _name(env: FMUEnv) -> str:
 
 
 def _outputs(env: FMUEnv) -> tuple[Variable, ...]:
-    return env.inside.spec.outputs[: env.inside.output_count]
+    return env.pool_spec.outputs[: env.interface.output_count]
 
 
 def _states(env: FMUEnv, given: Any) -> dict[str, str]:
@@ -193,7 +195,7 @@ def _states(env: FMUEnv, given: Any) -> dict[str, str]:
 
 def _obstacle(env: FMUEnv, states: States) -> str:
     """Why the FMU offers no directional derivatives for a trajectory; empty if it does."""
-    description, spec = env.fmu.description, env.inside.spec
+    description, spec = env.fmu.description, env.pool_spec
     if not description.capabilities.provides_derivatives:
         return "the FMU does not offer any"
     declared = set(description.state_derivatives)
@@ -227,9 +229,8 @@ def _by_directional_derivatives(
     envs: FMUVectorEnv, start: Snapshot, nominal: npt.NDArray[Any], states: States
 ) -> Matrices:
     """Play the trajectory with an instance of its own, and ask that for derivatives."""
-    env = envs.inside.maker.make()
+    env = envs.maker.make()
     try:
-        env.inside.use(env.inside.opening.open(1))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)
@@ -257,11 +258,11 @@ class _Follower:
 
     def __init__(self, env: FMUEnv, states: States) -> None:
         description = env.fmu.description
-        self._env, self._pool = env, env.inside.pool
+        self._env, self._pool = env, env.pool
         self._x = tuple(map(description.variable, states))
         slopes = description.state_derivatives
         self._x_dot = tuple(description.variable(slopes[name]) for name in states)
-        self._u, self._y = env.inside.spec.inputs, _outputs(env)
+        self._u, self._y = env.pool_spec.inputs, _outputs(env)
 
     def follow(self, nominal: npt.NDArray[Any]) -> Matrices:
         """Play the nominal actions."""
@@ -276,7 +277,7 @@ class _Follower:
             x.append(self._read())
             y.append(self._pool.outputs[: len(self._y), 0].copy())
         slopes, outputs, by_actions = map(np.array, zip(*rows, strict=True))
-        a, b = discrete(slopes, self._env.inside.spec.time_step)
+        a, b = discrete(slopes, self._env.pool_spec.time_step)
         by_x, by_u = outputs[:, :, :n], outputs[:, :, n:]
         d = (by_x @ b + by_u) @ by_actions
         return Matrices(a, b @ by_actions, by_x @ a, d, np.array(x), np.array(y))
@@ -335,13 +336,10 @@ def _require_no_feedback(env: FMUEnv, action: npt.NDArray[Any]) -> None:
     Raises:
         ConfigError: If the inputs change with the outputs.
     """
-    wanted, values, state = _inputs_of(env, action), env.inside.readings.outputs, env.state
-    env.inside.readings.outputs = tuple(value + 0.01 * (abs(value) or 1.0) for value in values)
-    env.state = env.inside.readings.outputs[: len(state)]
-    try:
-        found = _inputs_of(env, action)
-    finally:
-        env.inside.readings.outputs, env.state = values, state
+    wanted = written_inputs(env, action)
+    others = tuple(value + 0.01 * (abs(value) or 1.0) for value in env.episode.outputs)
+    with standing_in(env, env.episode.replaced(outputs=others)):
+        found = written_inputs(env, action)
     if found != wanted:
         raise ConfigError(
             "_get_inputs depends on the outputs, which directional derivatives of the FMU do not "
@@ -357,21 +355,9 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
     """
     space = float_box(env.action_space, "action")
     actions, widths = moved_alone(space, action[None], precise_step(space))
-    inputs = [_inputs_of(env, one[0]) for one in actions[::-1]]  # that of the action is the last
+    # The inputs of the action itself are the last that are written.
+    inputs = [written_inputs(env, one[0]) for one in actions[::-1]]
     return differences(np.array(inputs[::-1]), widths).T
-
-
-def _inputs_of(env: FMUEnv, action: Any) -> tuple[float, ...]:
-    """What the FMU's inputs would be with an action; they stay in the pool."""
-    read, writer = env.inside.readings, env.inside.input_writer
-    before = read.action, read.previous_action, read.previous_state, read.inputs
-    read.previous_action, read.previous_state, read.action = read.action, read.state, action
-    try:
-        inputs = writer.checked(env._get_inputs(), action)
-        writer.write(inputs, env.inside.input_row)
-        return inputs
-    finally:
-        read.take_back(before)
 
 
 def discrete(slopes: FloatArray, time_step: float) -> tuple[FloatArray, FloatArray]:

@@ -115,7 +115,7 @@ class Live:
         past.append((now, float(values[0])))
         times, values = np.append(before[0], times), np.append(before[1], values)
         for env in self._envs:
-            if lookup := env.inside.future.lookups.get(name):
+            if lookup := env.resolved.future.lookups.get(name):
                 fits = times < times[0] + lookup.period
                 table = lookup.table_of(name, (times[fits], values[fits]))
                 lookup.tables[lookup.key] = table

@@ -57,7 +57,7 @@ class Predictions:
         self._spread = spread(self.envs[0], 0) if steps else {}
         self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
         self._written = [Written(env, feed) for env in self.envs]
-        self._tags = feed.plant.of(self.envs[0].inside.spec.outputs) if steps else []
+        self._tags = feed.plant.of(self.envs[0].pool_spec.outputs) if steps else []
         self.names = [tag.name for tag in self._tags]
         # of the errors, by horizon and variable: how many, their sum, and that of their squares
         self._sums = np.zeros((3, steps, len(self.names)))

@@ -47,7 +47,7 @@ def _section(env: Any, protocol: str) -> dict[str, Any]:
     """All tags, one after another."""
     register = 4  # the clock takes those before
     found: dict[str, dict[str, Any]] = {"tags": {}, "data": {}}
-    for one in env.inside.quantities().all:
+    for one in env.resolved.quantities().all:
         if one.kind not in ("action", "output", "data"):
             continue
         ahead = _ahead(env, one.name) if one.kind == "data" else {}
@@ -61,7 +61,7 @@ def _section(env: Any, protocol: str) -> dict[str, Any]:
 def _ahead(env: TaskEnv, name: str) -> dict[str, Any]:
     """How many values of data there are, so that the agent sees far enough ahead."""
     root = as_declared(env.task.root, env.fmu.description)[0]
-    own = env.inside.spec.time_step
+    own = env.pool_spec.time_step
     steps = [one.get("step") or own for one in forecasts(root, name)]
     if not steps:
         return {}

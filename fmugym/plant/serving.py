@@ -66,7 +66,7 @@ class _Twin:
     most: float
 
     def __post_init__(self) -> None:
-        quantities, data = self.env.inside.quantities(), self.env.task.root.child("data").items()
+        quantities, data = self.env.resolved.quantities(), self.env.task.root.child("data").items()
         self._read_all = quantities.read
         self._quantities = {one.name: one for one in quantities.all}
         self._sensors = self._places_of_sensors()
@@ -124,7 +124,7 @@ class _Twin:
         while self._steps <= passed and self._steps < self.most:
             self._advance()
         part = passed - (self._steps - 1)
-        time = float(self.env.inside.future.clock(self.env)) + (part - 1.0) * self.plant.step
+        time = float(self.env.resolved.future.clock(self.env)) + (part - 1.0) * self.plant.step
         return {name: self._of_tag(tag, part, time) for name, tag in self.plant.tags.items()}
 
     def _of_tag(self, tag: Tag, part: float, time: float) -> tuple[float, ...]:

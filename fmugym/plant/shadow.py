@@ -137,11 +137,11 @@ def connect(
         env = stack.enter_context(closing(environment(own, backend=feed)))
         feed.plant = plant = read_plant(env, address)
         written = Written(env, feed)
-        for output in env.inside.spec.outputs:
+        for output in env.pool_spec.outputs:
             plant.require(output)
-        env.inside.held = feed.held
+        env.held_outputs = feed.held  # type: ignore[method-assign]  # of this environment
         model = watched.physical()
-        env.inside.model = partial(load, model)
+        env.planning_model = partial(load, model)
         copies = Predictions(
             lambda: stack.enter_context(closing(environment(model))),
             feed,

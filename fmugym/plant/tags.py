@@ -115,7 +115,7 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
     Raises:
         ConfigError: If there is none, or a name or a unit is wrong. The text says where.
     """
-    entry, step = env.task.root.child("plant"), env.inside.spec.time_step
+    entry, step = env.task.root.child("plant"), env.pool_spec.time_step
     if entry.value is None:
         raise env.task.root.error("the task has no [plant], which says where a plant has what")
     data = _data(env, entry)
@@ -143,8 +143,7 @@ def _data(env: TaskEnv, entry: Entry) -> dict[str, Entry]:
 
 
 def _tags(env: TaskEnv, entry: Entry, data: Mapping[str, Entry]) -> Iterator[Tag]:
-    inside: Any = env.inside
-    known = {one.name: one for one in inside.quantities().all}
+    known = {one.name: one for one in env.resolved.quantities().all}
     others = {*env.task.document.get("variables", ()), *env.fmu.description.variables}
     spellings = Spellings("variable of the task", dict.fromkeys([*known, *others]))
     with entry.child("tags").placing():
@@ -166,7 +165,7 @@ def _tags(env: TaskEnv, entry: Entry, data: Mapping[str, Entry]) -> Iterator[Tag
 def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
     """What a tag says of the variable of the FMU, if the task writes or reads one by this name."""
     own, unit = declared_as(env, name)
-    spec = env.inside.spec
+    spec = env.pool_spec
     for one in (*spec.outputs, *spec.inputs):
         if one.name == own:
             to_task = conversion_of(one, unit, env.fmu.description.units)

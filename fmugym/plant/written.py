@@ -33,7 +33,7 @@ class Written:
 
     def __init__(self, env: TaskEnv, feed: Feed) -> None:
         self._feed, plant = feed, feed.plant
-        self._inputs = {one.name: one for one in env.inside.spec.inputs}
+        self._inputs = {one.name: one for one in env.pool_spec.inputs}
         for alias in env.task.root.child("agent").child("actions").value or ():
             if variable := self._inputs.get(declared_as(env, alias)[0]):
                 plant.require(variable, alias)
@@ -42,8 +42,8 @@ class Written:
         self.actions = Actions(env, self._range_of, math.inf)
         self._own = env._get_inputs
         env._get_inputs = AssignedHook(self._get_inputs)  # type: ignore[method-assign]
-        if env.inside.warm_ups is not None:
-            warm_up = env.inside.warm_ups.warm_up
+        warm_up = env.warm_up
+        if warm_up is not None:
             self._of_warm_up = warm_up.inputs
             # that of this one warm-up, which must wait for the plant before the first observation
             warm_up.inputs = self._warm_inputs  # type: ignore[method-assign]

@@ -337,18 +337,18 @@ def prepare(
             ``EpisodeStreams``.
         episodes: Steps of each episode, shape (N,); which environments start an episode in
             the next step, shape (N,); steps after which an episode is truncated.
-        surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
-            the second program reads them; ``done``, for where the latest step has ended the
-            task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
-            they were before the step; ``drawn_variables``, rows and the numbers of their draws;
-            ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
-            each input the number of a start value, or -1 and a constant. ``results``, a tuple of
-            ``numpy.empty``; the class of a step's result, a tuple; the forms of observations and of
-            infos, each the number of an array, or a tuple of names and forms; the shape and type of
-            each array: float32 observations, or those that the second program stores, then rewards,
-            terminated and truncated of a step, mask and drawn values (draws, N) of a reset; and a
-            function of drawn values and a mask, which returns what infos tell of the episodes that
-            start.
+        surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether the second
+            program reads them; ``done``, for where the latest step has ended the task, shape (N,),
+            or None; ``before_inputs`` and ``before_judgement``, pairs of rows: values, and where
+            they are kept before a program replaces them; ``drawn_variables``, rows and the numbers
+            of their draws; ``variable_starts``, rows and the bytes of their constants;
+            ``input_starts``, for each input the number of a start value, or -1 and a constant.
+            ``results``, a tuple of ``numpy.empty``; the class of a step's result, a tuple; the
+            forms of observations and of infos, each the number of an array, or a tuple of names and
+            forms; the shape and type of each array: float32 observations, or those that the second
+            program stores, then rewards, terminated and truncated of a step, mask and drawn values
+            (draws, N) of a reset; and a function of drawn values and a mask, which returns what
+            infos tell of the episodes that start.
     """
     counts, ended, limit = episodes
     rows = Rows()

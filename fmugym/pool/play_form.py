@@ -61,7 +61,9 @@ def form_of_play(
     writer = Writer().integers(surroundings["reads_kept"], limit, none.size)
     writer.integers(*(actions[name] for name in ("size", "check", "lowest", "highest")))
     writer.integers(actions["current"] is not None).block(none.tobytes())
-    writer.array([[number(source), number(to)] for source, to in surroundings["copies"]], np.int64)
+    for moment in ("before_inputs", "before_judgement"):
+        pairs = surroundings[moment]
+        writer.array([[number(source), number(to)] for source, to in pairs], np.int64)
     starts = surroundings["variable_starts"]
     writer.array([(number(row), _bits_of(value)) for row, value in starts], np.int64)
     writer.array([(number(row), draw) for row, draw in surroundings["drawn_variables"]], np.int64)

@@ -171,12 +171,12 @@ def _varies(variable: Variable) -> bool:
 
 def quantities_of(env: FMUEnv) -> Quantities:
     """Everything in a task that has a name and a value: as declared, or else the config's."""
-    of_task = env.inside.quantities
+    of_task = None if env.resolved is None else env.resolved.quantities
     return _of_config(env) if of_task is None else of_task()
 
 
 def _of_config(env: FMUEnv) -> Quantities:
-    interface, strings = env.inside.interface, env.fmu.description.strings
+    interface, strings = env.interface, env.fmu.description.strings
     inputs, outputs = interface.inputs, (*interface.outputs, *interface.monitors)
     episode = [n for n, value in env.config.variable_starts.items() if np.ndim(value) == 0]
     parameters = tuple(name for name in interface.parameters if name not in strings)
@@ -185,7 +185,7 @@ def _of_config(env: FMUEnv) -> Quantities:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *env.inside.readings.outputs[: len(outputs)],
+            *env.out.values(),
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )
@@ -205,7 +205,7 @@ def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
     """The numbers of the FMU for which the task has no name of its own."""
-    known = {*env.inside.interface.input_names, *env.out, *(one.name for one in quantities)}
+    known = {*env.interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
         if variable.is_number:
             yield from (one for one in variable.elements if one.name not in known)

@@ -46,7 +46,7 @@ class _Recorder:
         patterns = [variables] if isinstance(variables, str) else variables
         self._choice = choose(episodes.prototype, patterns)
         self._indices = _chosen(environments, episodes.count)
-        self._every = _steps_of(every, episodes.prototype.inside.spec.time_step)
+        self._every = _steps_of(every, episodes.prototype.pool_spec.time_step)
         self._path = None if path is None else check_path("the path of a recording", path)
         self._most_rows = check_count("most_rows", most_rows)
         self._memory: Memory | None = None
@@ -133,7 +133,7 @@ class _One:
 
     @property
     def pool(self) -> Pool:
-        return self.prototype.inside.pool
+        return self.prototype.pool
 
 
 class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -221,15 +221,15 @@ class _Many:
     is_vector = True
 
     def __init__(self, envs: FMUVectorEnv) -> None:
-        self._inside, self.prototype, self.count = envs.inside, envs.inside.prototype, envs.num_envs
+        self._envs, self.prototype, self.count = envs, envs.prototype, envs.num_envs
         self.actions: Any = np.zeros(envs.action_space.shape, envs.action_space.dtype)
 
     def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
-        return self._inside.engine.evaluate(function, self.actions, indices)
+        return self._envs.engine.evaluate(function, self.actions, indices)
 
     @property
     def pool(self) -> Pool:
-        return self._inside.pool  # also within a step in the background
+        return self._envs.pool  # also within a step in the background
 
 
 class RecordVectorSeries(VectorWrapper):
@@ -267,7 +267,7 @@ class RecordVectorSeries(VectorWrapper):
         self._at_end: FloatArray | None = None
         self._steps: Any = None
         if self._mode is AutoresetMode.SAME_STEP:
-            env.inside.look_at_ends(self._look)
+            env.look_at_ends(self._look)
 
     def _look(self, actions: Any) -> None:
         """Read what environments have before the next episodes begin."""
@@ -306,7 +306,7 @@ class RecordVectorSeries(VectorWrapper):
     def _go_on(self) -> None:
         """Count the steps of episodes in the middle of which the recording begins."""
         envs: Any = self.env
-        if not self._recorder.has_begun and envs.inside.episodes.started:
+        if not self._recorder.has_begun and envs.episodes.started:
             everywhere = np.arange(self.num_envs)
             (self._steps,) = self._envs.evaluate(lambda env: (env.step_count,), everywhere)
 

@@ -209,8 +209,8 @@ class Rows:
         is_due = mask[self._indices]
         which = self._indices[is_due]
         env = self._episodes.prototype
-        spec = env.inside.spec
-        passed: Any = (env.inside.warm_up_steps + self._steps[which]) * spec.substeps
+        spec = env.pool_spec
+        passed: Any = (env.warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
             *([which] if self._episodes.is_vector else []),
             self._number[which],

@@ -16,7 +16,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.task.spaces import to_input_types
 
-__all__ = ["as_element", "elements_of", "flat_inputs", "no_action", "take_action"]
+__all__ = ["as_element", "elements_of", "flat_inputs", "no_action", "take_action", "written_inputs"]
 
 _OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 """The exceptions that indexing and arithmetic raise for values of a wrong kind or shape."""
@@ -54,7 +54,7 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
-def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
+def take_action(env: Any, action: Any) -> tuple[Any, ...]:
     """Let hooks make inputs of an action, and write them for the next step of the FMU.
 
     Args:
@@ -62,29 +62,49 @@ def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
         action: The action.
 
     Returns:
-        What hooks have read before, for ``Readings.take_back``.
+        What hooks have read before, for ``Episode.take_back``.
 
     Raises:
         ConfigError: If it cannot be used. Then nothing has happened.
     """
-    inside, read = env.inside, env.inside.readings
-    elements, action = inside.elements, _no_truth(env, action)
+    conversions, read = env._conversions, env._episode
+    elements, action = conversions.elements, _no_truth(env, action)
     if elements is None or type(action) not in _INTEGERS or action not in elements:
         _require_usable(env, action)
-        if inside.expressed and not inside.own.step:
+        if env._expressed and not env._own_hooks.step:
             action = as_element(env, action)[()]  # expressions read its elements
-    before = read.action, read.previous_action, read.previous_state, read.inputs
-    read.previous_action, read.previous_state, read.action = read.action, read.state, action
+    before: tuple[Any, ...] = read.keep()
+    read.action = action
     try:
-        read.inputs = inside.input_writer.checked(env._get_inputs(), action)
+        read.inputs = conversions.input_writer.checked(env._get_inputs(), action)
     except BaseException as error:  # the FMU was not touched: a better action may follow
         read.take_back(before)
         blaming = _blame(env, action, error)
         if blaming is not None:
             raise blaming from error
         raise
-    inside.input_writer.write(read.inputs, inside.input_row)
+    conversions.input_writer.write(read.inputs, env._instance.inputs)
     return before
+
+
+def written_inputs(env: Any, action: Any) -> tuple[float, ...]:
+    """The FMU's inputs that an action makes; they stay in the pool, and nothing steps.
+
+    Args:
+        env: A single environment, between two steps.
+        action: The action.
+
+    Raises:
+        ConfigError: If the inputs are not one finite number each.
+    """
+    read, writer = env._episode, env._conversions.input_writer
+    before, read.action = read.keep(), action
+    try:
+        inputs: tuple[float, ...] = writer.checked(env._get_inputs(), action)
+        writer.write(inputs, env._instance.inputs)
+        return inputs
+    finally:
+        read.take_back(before)
 
 
 def as_element(env: Any, action: Any) -> npt.NDArray[Any]:
@@ -95,7 +115,7 @@ def as_element(env: Any, action: Any) -> npt.NDArray[Any]:
     """
     space, action = env.action_space, _no_truth(env, action)
     _require_usable(env, action)
-    if env.inside.elements is not None:
+    if env._conversions.elements is not None:
         return np.array(operator.index(action), space.dtype)
     array = np.asarray(_of_shape(action, space))
     if array.dtype.kind == "f" and space.dtype.kind != "f":
@@ -106,13 +126,13 @@ def as_element(env: Any, action: Any) -> npt.NDArray[Any]:
 
 def _no_truth(env: Any, action: Any) -> Any:
     """The integer for a truth: an element of a ``Discrete`` for Gymnasium, but no index."""
-    is_truth = env.inside.elements is not None and isinstance(action, bool | np.bool_)
+    is_truth = env._conversions.elements is not None and isinstance(action, bool | np.bool_)
     return int(action) if is_truth else action
 
 
 def _require_usable(env: Any, action: Any) -> None:
     """Refuse an action that is no element of a ``Discrete``, or that has a NaN."""
-    elements = env.inside.elements
+    elements = env._conversions.elements
     if elements is not None:
         if not _is_element(action, elements):
             raise ConfigError(f"action {shown(action)} is not in {env.action_space}")
@@ -148,7 +168,7 @@ def _blame(env: Any, action: Any, error: BaseException) -> ConfigError | None:
     """The error if ``_get_inputs`` failed because of an action outside of the action space."""
     if isinstance(error, FMUGymError) or not isinstance(error, Exception):
         return None
-    if env.inside.own.step or not _is_misfit(action, env.action_space, error):
+    if env._own_hooks.step or not _is_misfit(action, env.action_space, error):
         return None  # with a step of its own, its actions may be others
     return ConfigError(f"action {shown(action)} is not in {env.action_space}: {shown(error)}")
 

@@ -14,8 +14,8 @@ import numpy as np
 from fmugym.pool import Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.licences import require_started
-from fmugym.task.episode import Episode, EpisodeDraws
-from fmugym.task.readings import Readings
+from fmugym.task.episode import Episode
+from fmugym.task.episode_start import EpisodeStart, EpisodeValues
 
 __all__ = ["FIRST", "Beginning", "BeginningOfOne"]
 
@@ -34,10 +34,10 @@ class Beginning(ABC):
     """
 
     def __init__(
-        self, env: Any, draws: EpisodeDraws, episode: Episode, indices: IndexArray = FIRST
+        self, env: Any, draws: EpisodeStart, episode: EpisodeValues, indices: IndexArray = FIRST
     ) -> None:
         self.env, self.draws, self.episode, self.indices = env, draws, episode, indices
-        self.pool: Pool = env.inside.pool
+        self.pool: Pool = env._instance.pool
 
     def begin(self) -> None:
         """Start the FMUs, and let hooks read what episodes begin with.
@@ -46,7 +46,7 @@ class Beginning(ABC):
             SimulationError: If an FMU cannot be initialized, or its warm-up fails.
             ConfigError: If an input of a warm-up does not fit its type.
         """
-        warm_ups = self.env.inside.warm_ups
+        warm_ups = self.env._warm_ups
         if warm_ups is None:
             self._start(self.indices)
             self._forget()
@@ -55,7 +55,7 @@ class Beginning(ABC):
             warm_ups.begin(self)
         self.look()
 
-    def start(self, indices: IndexArray) -> Readings:
+    def start(self, indices: IndexArray) -> Episode:
         """Start the FMUs of some of the environments before their warm-up.
 
         Returns:
@@ -63,7 +63,7 @@ class Beginning(ABC):
         """
         self._start(indices)
         self.look()
-        return self.readings(indices)
+        return self.episodes(indices)
 
     def _start(self, indices: IndexArray) -> None:
         pool, mask = self.pool, None
@@ -76,8 +76,9 @@ class Beginning(ABC):
 
     def _forget(self) -> None:
         """Let hooks read nothing of earlier episodes, but for the outputs."""
-        inside, given = self.env.inside, self.episode.parameters.get
-        self.clear([given(name, start) for name, start in inside.start_inputs], inside.no_action)
+        env, given = self.env, self.episode.parameters.get
+        inputs = [given(name, start) for name, start in env.interface.start_inputs]
+        self.clear(inputs, env._conversions.no_action)
 
     @abstractmethod
     def clear(self, inputs: list[Any], action: Any) -> None:
@@ -93,7 +94,7 @@ class Beginning(ABC):
         """Let hooks read the outputs of episodes that have not stepped yet."""
 
     @abstractmethod
-    def readings(self, indices: IndexArray) -> Readings:
+    def episodes(self, indices: IndexArray) -> Episode:
         """What the hooks of some environments read: new arrays, environments on the last axis."""
 
     @abstractmethod
@@ -110,30 +111,30 @@ class BeginningOfOne(Beginning):
 
     def clear(self, inputs: list[Any], action: Any) -> None:
         """See ``Beginning.clear``."""
-        inside, episode = self.env.inside, self.episode
-        inside.readings.begin(inputs, action, episode.parameters, episode.variables)
-        inside.pictured = None, 0.0
+        env, episode = self.env, self.episode
+        env._episode.begin(inputs, action, episode.parameters, episode.variables)
+        env._pictured = None, 0.0
 
     def look(self) -> None:
         """See ``Beginning.look``."""
-        self.env.inside.readings.look(self.env.inside.output_row)
+        self.env._episode.look(self.env._instance.outputs)
 
-    def readings(self, indices: IndexArray) -> Readings:
-        """See ``Beginning.readings``."""
-        read: Readings = self.env.inside.readings
+    def episodes(self, indices: IndexArray) -> Episode:
+        """See ``Beginning.episodes``."""
+        read: Episode = self.env._episode
         return read.mapped(_as_row)
 
     def row(self, name: str) -> Any:
         """See ``Beginning.row``."""
-        return _as_row(self.env.inside.readings.variables[name])
+        return _as_row(self.env._episode.variables[name])
 
     def place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
         """See ``Beginning.place``; the warm-up has left inputs, too."""
-        read = self.env.inside.readings
+        read = self.env._episode
         for name, row in values.items():
             part = row[..., 0]
             read.variables[name] = part.item() if part.ndim == 0 else part
-        read.inputs = tuple(self.env.inside.input_row.tolist())
+        read.inputs = tuple(self.env._instance.inputs.tolist())
 
 
 def _as_row(value: Any) -> Any:

@@ -18,6 +18,7 @@ from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.language import CONSTANTS, Expression, Names
 from fmugym.expressions.mathematics import FUNCTIONS
+from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
 from fmugym.task.interface import Interface
 from fmugym.task.spaces import discrete_values
@@ -165,11 +166,19 @@ class _ClassFormulas:
         return value
 
     def _found_before(self, name: str, has_stepped: bool) -> Value | None:
-        """The value before the step: of actions, and of outputs once the FMU has stepped."""
-        variable = self._interface.description.find(name)
-        outputs = [one.name for one in self._interface.outputs] if has_stepped else []
-        if variable is not None and variable.name in outputs:
-            return self._read("previous_outputs", outputs.index(variable.name))
+        """The value before the step: of actions, of other quantities that keep it, and of outputs.
+
+        That of outputs is known once the FMU has stepped.
+        """
+        interface = self._interface
+        variable = interface.description.find(name)
+        own = name if variable is None else variable.name
+        names: dict[str, Sequence[str]] = {"inputs": interface.input_names}
+        if has_stepped:
+            names["state"] = [one.name for one in interface.outputs]
+        for quantity in QUANTITIES.values():
+            if own in names.get(quantity.of, ()):
+                return self._read(quantity.name, names[quantity.of].index(own))
         return self._actions("previous_action").get(name)
 
     def _names(self, is_judged: bool = True, has_stepped: bool = True) -> Names:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache
 from inspect import getattr_static
 from math import floor, isfinite, nan
+from threading import RLock
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self
 from weakref import WeakSet
 
-import numpy as np
 from gymnasium import spaces
 
 from fmugym.checks import check_mapping
@@ -27,19 +28,18 @@ from fmugym.expressions.quantities import KEPT
 from fmugym.expressions.value import Value
 from fmugym.pool import Pool, PoolSpec
 from fmugym.systems import FMUSystem
-from fmugym.task import spaces as fmu_spaces
-from fmugym.task.actions import elements_of, no_action
 from fmugym.task.class_formulas import class_formulas, with_monitors
-from fmugym.task.episode import EpisodeDraws
+from fmugym.task.conversions import Conversions
+from fmugym.task.episode import READABLE, Episode, NoEpisode
+from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.hooks import AssignedHook, Hooks, misspelt_hooks
-from fmugym.task.input_writer import InputWriter
-from fmugym.task.inside import Inside, OwnHooks, is_overridden
-from fmugym.task.interface import resolve
+from fmugym.task.instance import Instance
+from fmugym.task.interface import Interface, resolve
+from fmugym.task.own_hooks import OwnHooks, is_overridden
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
 from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
-from fmugym.task.readings import READINGS, Readings
-from fmugym.task.results import finiteness_of
+from fmugym.task.snapshot import Scope
 from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
@@ -61,27 +61,81 @@ class Constructed(Pictured):
 
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
-    _warm_up: WarmUp | None = None
-    """What happens in warm-ups with moving inputs; the pool knows of others only."""
+    _base: ClassVar[type]
+    """``FMUEnv``, with whose methods those of a class are compared."""
+
+    # The task.
+
+    interface: Interface
+    pool_spec: PoolSpec
+    episode_start: EpisodeStart
+    step_limit: int
+    warm_up_steps: int
+    warm_up: WarmUp | None = None
+    formulas: Formulas | None = None
+    resolved: Any = None
+    planning_model: Callable[[], Any] | None = None
+
+    _own_hooks: OwnHooks
+    _conversions: Conversions
+    _expressed: Mapping[str, Callable[[Any], Any]] = MappingProxyType({})
+    """By name, functions of the environment that evaluate its formulas; defaults of hooks."""
+
+    _compiled_step: Any = None
+    """The step by programs, if the hooks are expressions and a native pool steps the FMU."""
+
+    _has_compiled: bool = False
+    """Whether it is known if there is such a step."""
+
+    _warm_ups: WarmUps | None = None
+    _variable_starts: dict[str, Any] = {}  # noqa: RUF012  (replaced, never written)
+    """By name, what episode variables start with in the place of what the config says."""
+
+    # The FMU and its episode.
+
+    pool_opening: PoolOpening
+    _instance: Instance
+    """While the pool is open."""
+
+    _episode: Episode = NoEpisode()  # type: ignore[assignment]  # until there is one
+    _standing_in: AbstractContextManager[Any]
+    """Held while other values stand in for those that hooks read: threads that do so at once would
+    put back each other's."""
+
+    _ended: bool = True
+    _is_closed: bool = False
+
+    # Attributes of the class.
+
+    _number: int
+    """Tells which environments are newer."""
+
+    _own_names: frozenset[str] = frozenset()
+    """The attributes that are not a subclass's own."""
+
+    _as_constructed: Mapping[str, Any]
+    """The plain attributes of a subclass when its hooks were prepared."""
+
+    _scope: Scope | None = None
+    """What snapshots of it fit; see ``scope_of``."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keep the arguments, because an environment pickles as its class and arguments."""
         env = super().__new__(cls)
         env._constructor_arguments = args, kwargs
-        env.inside = Inside(next(env_numbers))
+        env._number, env._standing_in = next(env_numbers), RLock()
         return env
 
     def _construct(
         self,
-        base: type,
         fmu_path: str | os.PathLike[str] | FMUSystem,
         config: Mapping[str, Any] | EnvConfig,
         log_level: int,
         render_mode: str | None,
     ) -> None:
         """Do everything that a constructor does before there is a pool."""
-        foreign, self.inside.base = set(vars(self)), base
-        _require_readings(type(self))
+        foreign = set(vars(self))
+        _require_own_names_free(type(self))
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
         _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
@@ -89,44 +143,73 @@ class Constructed(Pictured):
         self.fmu = open_fmu(type(self), fmu_path, self.config, self.fmi_interface)
         self._require_fmi_version()
         self.config = with_monitors(self.config, self.fmu.description)
-        self.inside.interface = resolve(self.config, self.fmu.description)
-        self.inside.spec = self.inside.interface.pool_spec()
-        self.inside.warm_up_steps = self.inside.spec.warm_up_steps
-        if self._warm_up is not None:
-            self.inside.spec = replace(self.inside.spec, warm_up_steps=0)
-            self.inside.warm_ups = WarmUps(self, self._warm_up)
+        self.interface = resolve(self.config, self.fmu.description)
+        self.pool_spec = self.interface.pool_spec()
+        self.warm_up_steps = self.pool_spec.warm_up_steps
+        if self.warm_up is not None:
+            self.pool_spec = replace(self.pool_spec, warm_up_steps=0)
+            self._warm_ups = WarmUps(self, self.warm_up)
         self._warn_of_peculiarities()
         self._prepare_values()
         self._prepare_episodes()
         self._prepare_spaces()
         self._prepare_formulas()
         prepare_hooks(self)
-        self.inside.own_names = _names_of(self.inside.base) | vars(self).keys() - foreign
+        self._own_names = _names_of(self._base) | vars(self).keys() - foreign
 
     def _open(self, backend: Any, isolation: str | None) -> None:
         """Open the pool, unless a vector environment is going to give one."""
-        self.inside.opening = PoolOpening(
+        self.pool_opening = PoolOpening(
             self.fmu,
-            self.inside.spec,
+            self.pool_spec,
             self.config,
-            self.inside.draws,
+            self.episode_start,
             self.logger,
             backend,
             isolation,
         )
         if not pools_are_deferred():
-            self.inside.use(self.inside.opening.open())
+            self._use(self.pool_opening.open())
+
+    @property
+    def _is_open(self) -> bool:
+        return "_instance" in vars(self)
+
+    def held_outputs(self) -> Sequence[str]:
+        """The outputs that a plant has not told now, whose last values go on."""
+        return ()
+
+    def _use(self, pool: Pool) -> None:
+        """Let a pool of one step the FMU, or one of N if a vector environment does it."""
+        self._instance = Instance(pool)
+
+    def _close_pool(self) -> None:
+        """Close the pool, if one is open; hooks then read what the latest step has left."""
+        if self._is_open:
+            self._episode, self._ended = self._episode.copy(), True
+            self._compiled_step, self._has_compiled = None, False
+            self._instance.pool.close()
+            del self._instance
+
+    @property
+    def pool(self) -> Pool:
+        """The pool that has the FMU.
+
+        Raises:
+            SimulationError: If the environment is closed.
+        """
+        return self._open_pool("pool")
 
     def _open_pool(self, method: str) -> Pool:
         """The pool, which is opened now if that has been deferred."""
-        if not self.inside.is_open:
+        if not self._is_open:
             require_construction(self)
-            if self.inside.is_closed:
+            if self._is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-            self.inside.opening = self.inside.opening.apart()
-            self.fmu = self.inside.opening.fmu
-            self.inside.use(self.inside.opening.open())
-        return self.inside.pool
+            self.pool_opening = self.pool_opening.apart()
+            self.fmu = self.pool_opening.fmu
+            self._use(self.pool_opening.open())
+        return self._instance.pool
 
     @property
     def reset_method(self) -> str:
@@ -145,15 +228,15 @@ class Constructed(Pictured):
 
     def _warn_of_peculiarities(self) -> None:
         internal = self.fmu.description.fixed_internal_step_size
-        if internal is not None and self.inside.spec.communication_step_size < 0.999999 * internal:
+        if internal is not None and self.pool_spec.communication_step_size < 0.999999 * internal:
             self.logger.warning(
                 "the communication step of %g s is smaller than the internal step of %g s of %s: "
                 "some of the steps will do nothing",
-                self.inside.spec.communication_step_size,
+                self.pool_spec.communication_step_size,
                 internal,
                 self.fmu.path.name,
             )
-        for method, hook in _misspelt(type(self), self.inside.base):
+        for method, hook in _misspelt(type(self), self._base):
             self.logger.warning(
                 "%s has a method %r, but no hook %r: is its name misspelt?",
                 *(type(self).__name__, method, hook),
@@ -164,37 +247,31 @@ class Constructed(Pictured):
 
     def _prepare_values(self) -> None:
         """Set what hooks may read to what it is before the first reset."""
-        interface = self.inside.interface
+        interface = self.interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
         fps = min(1 / interface.time_step, _FASTEST_FPS)
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
-        self.inside.output_count = len(interface.outputs)
-        self.inside.no_monitors = not interface.monitors
-        self.inside.start_inputs = [(v.name, v.start_number) for v in interface.inputs]
-        self.inside.readings = self._first_readings(names)
+        self._episode = self._first_episode(names)
 
-    def _first_readings(self, names: Sequence[str]) -> Readings:
-        inside = self.inside
-        start = {"start_time": inside.spec.start_time} if self.config.draws_start_time else {}
+    def _first_episode(self, names: Sequence[str]) -> Episode:
+        start = {"start_time": self.pool_spec.start_time} if self.config.draws_start_time else {}
         values = {
             "outputs": (nan,) * len(names),
-            "states": (nan,) * inside.output_count,
-            "inputs": tuple(start for _, start in inside.start_inputs),
+            "states": (nan,) * self.interface.output_count,
+            "inputs": tuple(start for _, start in self.interface.start_inputs),
             "action": None,
         }
-        return Readings(
-            NamedValues("output", names, lambda: inside.readings.outputs),
-            inside.output_count,
+        return Episode(
+            NamedValues("output", names, lambda: self._episode.outputs),
+            self.interface.output_count,
             parameters=MappingProxyType(start),
             variables=EpisodeVariables(self.config.variable_starts),
-            **{one.attribute: values.get(one.shape, one.dtype.type().item()) for one in KEPT},
+            **{one.attribute: values.get(one.shape, one.zero) for one in KEPT},
         )
 
     def _prepare_episodes(self) -> None:
-        self.inside.draws = draws_of(self)
-        self.inside.step_limit = _step_limit(
-            self.config, self.inside.spec, self.inside.warm_up_steps
-        )
+        self.episode_start = draws_of(self)
+        self.step_limit = _step_limit(self.config, self.pool_spec, self.warm_up_steps)
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -205,25 +282,23 @@ class Constructed(Pictured):
                     f"{type(self).__name__}._get_{name}_space returned {shown(space)}, "
                     "expected a gymnasium.spaces.Space"
                 )
-        self.inside.no_action = no_action(self.action_space)
 
     def _prepare_formulas(self) -> None:
-        inside = self.inside
-        if inside.formulas is None:
-            has_inputs = is_overridden(self, inside.base, "_get_inputs")
-            inside.formulas = class_formulas(
-                self.config, inside.interface, self.action_space, has_inputs
+        if self.formulas is None:
+            has_inputs = is_overridden(self, "_get_inputs")
+            self.formulas = class_formulas(
+                self.config, self.interface, self.action_space, has_inputs
             )
-            if self.config.terminated is None and not is_overridden(self, inside.base, "_is_done"):
+            if self.config.terminated is None and not is_overridden(self, "_is_done"):
                 raise ConfigError(
                     f"{type(self).__name__} does not say when the task has ended: give the config "
                     "key 'terminated', such as 'abs(x) > 1' or 'false', or override _is_done"
                 )
-        if inside.formulas is None:
+        if self.formulas is None:
             return
         if self.config.draws_start_time and self.config.stop_time is not None:
-            inside.formulas = _until_stop_time(inside.formulas, self.config, inside.spec)
-        inside.expressed = hooks_of(inside.formulas)
+            self.formulas = _until_stop_time(self.formulas, self.config, self.pool_spec)
+        self._expressed = hooks_of(self.formulas)
 
 
 def require_construction(env: Constructed) -> None:
@@ -232,7 +307,7 @@ def require_construction(env: Constructed) -> None:
     Raises:
         ConfigError: If it has not.
     """
-    if not hasattr(env.inside, "opening"):
+    if not hasattr(env, "pool_opening"):
         name = type(env).__name__
         raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 
@@ -243,27 +318,18 @@ def prepare_hooks(env: Constructed) -> None:
     Raises:
         ConfigError: If a hook of a step is an attribute of the environment.
     """
-    inside, space, base = env.inside, env.observation_space, env.inside.base
     _require_methods(env)
     if env.config.draws_start_time and env.config.stop_time is not None:
         _let_stop_time_end_episodes(env)
-    inside.own = own = OwnHooks.of(env, base, inside.expressed)
-    # A subclass with its own step may take other actions.
-    inside.elements = None if own.step else elements_of(env.action_space)
-    interface, derived = inside.interface, not own.get_action_space
-    values = fmu_spaces.discrete_values(interface.chosen_inputs) if derived else None
-    inside.action_values = values
-    if own.get_action_space and not own.get_inputs:
-        fmu_spaces.check_choices(interface.inputs, env.action_space)
-    default = not own.get_observation
-    make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
-    inside.observe = make(interface, space)
-    inside.is_finite = finiteness_of(space)
-    # The pool writes this observation in the pass that steps the FMU.
-    inside.pool_observes = default and isinstance(space, spaces.Box) and space.dtype == np.float32
-    inside.has_info = own.get_info or inside.pool_tells
-    inside.input_writer = InputWriter(interface.inputs)
-    inside.as_constructed = plain_attributes(vars(env), inside.own_names)
+    env._own_hooks = own = OwnHooks.of(env, env._expressed)
+    env._conversions = Conversions.of(
+        env.interface,
+        env.action_space,
+        env.observation_space,
+        own,
+        tells=env._is_open and env._instance.tells,
+    )
+    env._as_constructed = plain_attributes(vars(env), env._own_names)
 
 
 def _require_methods(env: Constructed) -> None:
@@ -277,20 +343,20 @@ def _require_methods(env: Constructed) -> None:
 
 def _let_stop_time_end_episodes(env: Constructed) -> None:
     """Each episode has its own last step, as each has its own start time."""
-    inside, name = env.inside, "_is_truncated"
+    name = "_is_truncated"
     hook, stop_time = env._is_truncated, env.config.stop_time or 0.0
-    is_expressed = name in inside.expressed and not is_overridden(env, inside.base, name)
+    is_expressed = name in env._expressed and not is_overridden(env, name)
     if is_expressed or isinstance(hook, AssignedHook):
         return
 
     def is_truncated() -> Any:
         rest: Any = stop_time - env.time
-        return hook() | (rest < inside.spec.time_step * (1 - 1e-9))
+        return hook() | (rest < env.pool_spec.time_step * (1 - 1e-9))
 
     env._is_truncated = AssignedHook(is_truncated)  # type: ignore[method-assign]
 
 
-def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodeDraws:
+def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodeStart:
     """Prepare the draws of an environment's episodes.
 
     Args:
@@ -300,21 +366,21 @@ def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> Episo
     Raises:
         ConfigError: If a parameter does not fit.
     """
-    interface = env.inside.interface
+    interface = env.interface
     given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
     own = interface.start_values(given)
     given_variables = {name: interface.parameter(name, value) for name, value in own.items()}
-    return EpisodeDraws(
+    return EpisodeStart(
         tuple((interface.parameter_variables | given_variables).values()),
         {**interface.parameters, **own},
-        env.config.variable_starts | env.inside.variable_starts,
+        env.config.variable_starts | env._variable_starts,
         own.keys(),
     )
 
 
 def draws_of_reset(
     env: Constructed, options: Mapping[str, Any] | None, *also_known: str
-) -> EpisodeDraws:
+) -> EpisodeStart:
     """Prepare the draws of the episodes that a reset with options begins.
 
     Args:
@@ -326,13 +392,13 @@ def draws_of_reset(
         ConfigError: If an option does not fit.
     """
     if options is None:
-        return env.inside.draws
+        return env.episode_start
     options = check_mapping("the options of reset", options)
     for name in options:
         if name not in env.reset_options:
             raise unknown_name("reset option", name, (*env.reset_options, *also_known))
     if not options:
-        return env.inside.draws
+        return env.episode_start
     parameters = env._get_episode_parameters(options)
     return draws_of(env, check_mapping("what _get_episode_parameters returned", parameters))
 
@@ -355,9 +421,9 @@ def _names_of(base: type) -> frozenset[str]:
     return frozenset(dir(base)).union(announced)
 
 
-def _require_readings(cls: type[Any]) -> None:
+def _require_own_names_free(cls: type[Any]) -> None:
     """Refuse classes with attributes of their own in the places of what hooks read."""
-    for name in READINGS:
+    for name in READABLE:
         if getattr_static(cls, name) is not vars(Hooks)[name]:
             raise ConfigError(
                 f"{cls.__name__} has an attribute {name!r} of its own, but hooks read the "

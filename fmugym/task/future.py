@@ -13,7 +13,7 @@ import numpy.typing as npt
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray
 
-__all__ = ["Future", "HeldOut", "Lookup", "Span", "assumed", "distance_of"]
+__all__ = ["Future", "HeldOut", "Lookup", "Span", "assumed", "distance_of", "future_of"]
 
 _YEAR: Final = 365 * 86400.0
 
@@ -161,6 +161,11 @@ class Future(NamedTuple):
     keys: tuple[str, ...]
     clock: Callable[[Any], Any]
     held_out: tuple[HeldOut, ...] = ()
+
+
+def future_of(env: Any) -> Future | None:
+    """The data of a declared task, and its noise to come; None for other tasks."""
+    return None if env.resolved is None else env.resolved.future
 
 
 @contextmanager

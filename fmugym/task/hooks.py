@@ -17,8 +17,10 @@ from fmugym.checks import check_mapping
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.inside import Inside
-from fmugym.task.readings import READINGS, environments_first, read_by
+from fmugym.task.conversions import Conversions
+from fmugym.task.episode import READABLE, Episode, environments_first, read_by
+from fmugym.task.interface import Interface
+from fmugym.task.own_hooks import OwnHooks
 from fmugym.task.values import NamedValues
 
 if TYPE_CHECKING:
@@ -86,7 +88,7 @@ class Hooks(gymnasium.Env[Any, Any]):
 
     config: EnvConfig
 
-    # The readings, which are made of the table of quantities below.
+    # The quantities of an episode, which are made of the table of quantities below.
     state: Any
     previous_state: Any
     out: NamedValues
@@ -99,7 +101,11 @@ class Hooks(gymnasium.Env[Any, Any]):
     parameters: Mapping[str, Any]
     variables: dict[str, Any]
 
-    inside: Inside
+    interface: Interface
+    _episode: Episode
+    _own_hooks: OwnHooks
+    _conversions: Conversions
+    _expressed: Mapping[str, Callable[[Any], Any]]
 
     # In the order of a step.
 
@@ -111,10 +117,10 @@ class Hooks(gymnasium.Env[Any, Any]):
             and the elements of the action. For a ``Discrete`` made from an Enumeration or Integer,
             it is the value of the element.
         """
-        evaluate = self.inside.expressed.get("_get_inputs")
+        evaluate = self._expressed.get("_get_inputs")
         if evaluate is not None:
             return evaluate(self)
-        values = self.inside.action_values
+        values = self._conversions.action_values
         if values is None:
             return self.action
         if isinstance(values, range):  # the range of an Integer, which may be wide
@@ -126,7 +132,7 @@ class Hooks(gymnasium.Env[Any, Any]):
 
         By default, the expressions of ``memory`` do so.
         """
-        evaluate = self.inside.expressed.get("_update")
+        evaluate = self._expressed.get("_update")
         if evaluate is not None:
             evaluate(self)
 
@@ -135,7 +141,7 @@ class Hooks(gymnasium.Env[Any, Any]):
 
         By default, ``terminated`` of the config says so.
         """
-        evaluate = self.inside.expressed.get("_is_done")
+        evaluate = self._expressed.get("_is_done")
         return False if evaluate is None else evaluate(self)
 
     def _is_truncated(self) -> Any:
@@ -143,7 +149,7 @@ class Hooks(gymnasium.Env[Any, Any]):
 
         By default, ``truncated`` of the config says so.
         """
-        evaluate = self.inside.expressed.get("_is_truncated")
+        evaluate = self._expressed.get("_is_truncated")
         return False if evaluate is None else evaluate(self)
 
     def _reward_policy(self) -> Any:
@@ -154,11 +160,11 @@ class Hooks(gymnasium.Env[Any, Any]):
             ended and ``positive_reward`` otherwise. For a goal task, ``_goal_reward`` of this
             observation.
         """
-        evaluate = self.inside.expressed.get("_reward_policy")
+        evaluate = self._expressed.get("_reward_policy")
         if evaluate is not None:
             return evaluate(self)
         positive, negative = self.config.positive_reward, self.config.negative_reward
-        if self.inside.own.goal_reward:
+        if self._own_hooks.goal_reward:
             return self._reward_for_goals(self._get_observation())
         if isinstance(self.done, bool):
             return negative if self.done else positive
@@ -182,7 +188,7 @@ class Hooks(gymnasium.Env[Any, Any]):
 
         ``_goal_reward`` gets copies: what it does to them must not change the observation.
         """
-        if self.inside.own.reward_policy or not self.inside.own.goal_reward:
+        if self._own_hooks.reward_policy or not self._own_hooks.goal_reward:
             reward = self._reward_policy()
             return reward, self._get_observation()
         observation = self._get_observation()
@@ -203,29 +209,29 @@ class Hooks(gymnasium.Env[Any, Any]):
             observation space. If they do not fit that space (an overriding hook may add elements),
             in the type of their default space.
         """
-        evaluate = self.inside.expressed.get("_get_observation")
+        evaluate = self._expressed.get("_get_observation")
         if evaluate is not None:
             elements = np.broadcast_arrays(*evaluate(self))
             return np.array(elements, dtype=self.observation_space.dtype)
-        return self.inside.observe(self.state)
+        return self._conversions.observe(self.state)
 
     def _get_info(self) -> dict[str, Any]:
         """Additional facts about this step by name, as a new dict.
 
         By default, those of ``reward`` with names, ``costs`` and ``info`` of the config.
         """
-        evaluate = self.inside.expressed.get("_get_info")
+        evaluate = self._expressed.get("_get_info")
         return {} if evaluate is None else dict(evaluate(self))
 
     # Called once, at construction.
 
     def _get_action_space(self) -> spaces.Space[Any]:
         """The action space; by default made from the inputs' types, min and max."""
-        return fmu_spaces.action_space(self.inside.interface)
+        return fmu_spaces.action_space(self.interface)
 
     def _get_observation_space(self) -> spaces.Space[Any]:
         """The observation space; by default made from the outputs' types, min and max."""
-        return fmu_spaces.observation_space(self.inside.interface)
+        return fmu_spaces.observation_space(self.interface)
 
     # For some tasks only.
 
@@ -239,7 +245,7 @@ class Hooks(gymnasium.Env[Any, Any]):
 
     def _explain(self, reward: float) -> str:
         """Say where a reward that is not finite comes from."""
-        if "_reward_policy" in self.inside.expressed:
+        if "_reward_policy" in self._expressed:
             texts = [repr(term["expr"].text) for term in self.config.reward_terms.values()]
             return f"the reward {' + '.join(texts)} is {reward}"
         return f"_reward_policy returned {reward}"
@@ -263,5 +269,5 @@ class Hooks(gymnasium.Env[Any, Any]):
         return ", ".join(f"{value:+.3g}" for value in self.inputs)
 
 
-for _name in READINGS:
+for _name in READABLE:
     setattr(Hooks, _name, read_by(_name))

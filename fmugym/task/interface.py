@@ -80,6 +80,16 @@ class Interface:
         """The inputs that the action writes: those without an expression."""
         return tuple(v for v in self.inputs if v.name not in self.expressions_of_inputs)
 
+    @cached_property
+    def output_count(self) -> int:
+        """The number of outputs, without the monitored variables."""
+        return len(self.outputs)
+
+    @cached_property
+    def start_inputs(self) -> list[tuple[str, float]]:
+        """The names and start values of the inputs."""
+        return [(v.name, v.start_number) for v in self.inputs]
+
     @property
     def time_step(self) -> float:
         """Length of one step in seconds."""

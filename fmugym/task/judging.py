@@ -37,39 +37,38 @@ def judged(env: Constructed, status: int, values: tuple[float, ...] | None = Non
         ConfigError: If a hook returns something unusable.
         SimulationError: After a fault with ``on_fault="raise"``.
     """
-    inside = env.inside
     stopped = False
     if status:
         stopped = status == _TERMINATED
         if status > WARNING_CODE and not stopped:
-            return _fault(env, inside.pool.failure(0))
-    read = inside.readings
-    variables = read.variables.copy() if inside.own.update else None
+            return _fault(env, env._instance.pool.failure(0))
+    read = env._episode
+    variables = read.variables.copy() if env._own_hooks.update else None
     before = read.outputs
     if values is None:
-        values = tuple(inside.output_row.tolist())  # Python's floats are faster
+        values = tuple(env._instance.outputs.tolist())  # Python's floats are faster
     read.outputs = values
-    read.state = values if inside.no_monitors else values[: inside.output_count]
-    observed = inside.observation_row.copy() if inside.pool_observes else None
-    cut_off = read.step_count >= inside.step_limit
+    read.state = values if not env.interface.monitors else values[: env.interface.output_count]
+    observed = env._instance.observation.copy() if env._conversions.pool_observes else None
+    cut_off = read.step_count >= env.step_limit
     observation, reward, terminated, truncated = conclude(env, NUMBERS, stopped, cut_off, observed)
     # One call for all numbers, which is enough for nearly all steps.
     is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
-    if not is_small and not (isfinite(reward) and inside.is_finite(observation)):
+    if not is_small and not (isfinite(reward) and env._conversions.is_finite(observation)):
         return _fault_of_hooks(env, reward, observation, (before, variables))
-    info = info_of(env) if inside.has_info else {}
+    info = info_of(env) if env._conversions.has_info else {}
     if stopped:
         info["fmu_terminated"] = True
     if terminated or truncated:
-        inside.ended = True
+        env._ended = True
     return observation, reward, terminated, truncated, info
 
 
 def info_of(env: Constructed) -> dict[str, Any]:
     """The info of the hook and of the pool."""
     info = as_info(env._get_info())
-    if env.inside.pool_tells:
-        info = info | {name: value.item(0) for name, value in env.inside.pool.info().items()}
+    if env._instance.tells:
+        info = info | {name: value.item(0) for name, value in env._instance.pool.info().items()}
     return info
 
 
@@ -81,9 +80,9 @@ def first_observation(env: Constructed) -> tuple[Any, dict[str, Any]]:
         SimulationError: If the observation is not finite.
     """
     observation = env._get_observation()
-    if not env.inside.is_finite(observation):
+    if not env._conversions.is_finite(observation):
         raise SimulationError(f"the first observation is not finite: {shown(observation)}")
-    return observation, info_of(env) if env.inside.has_info else {}
+    return observation, info_of(env) if env._conversions.has_info else {}
 
 
 def _fault_of_hooks(
@@ -104,12 +103,12 @@ def _fault_of_hooks(
         SimulationError: With ``on_fault="raise"``.
     """
     reason = not_finite(env, reward, observation)
-    read = env.inside.readings
+    read = env._episode
     read.outputs, variables = before
     read.state = read.previous_state
     read.variables.update(variables or {})
-    env.inside.pool.note_fault(0)
-    env.inside.halt()
+    env._instance.pool.note_fault(0)
+    env._instance.halt()
     return _fault(env, reason)
 
 
@@ -121,15 +120,15 @@ def not_finite(env: Constructed, reward: float, observation: Any) -> str:
 
 
 def _fault(env: Constructed, reason: str) -> Result:
-    env.inside.ended = True
+    env._ended = True
     policy = env.config.on_fault
     if policy == "raise":
         raise SimulationError(reason)
     env.logger.warning("%s", reason)
     env.done = policy == "terminate"
-    rate = float(fault_rates(env.inside.pool.health())[0])
+    rate = float(fault_rates(env._instance.pool.health())[0])
     info = info_of(env) | {"fault": reason, "fault_rate": rate}
     observation = env._get_observation()
-    if not env.inside.is_finite(observation):
+    if not env._conversions.is_finite(observation):
         raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
     return observation, as_reward(env._fault_reward()), env.done, not env.done, info

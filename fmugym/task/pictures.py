@@ -24,6 +24,13 @@ class Pictured(Hooks):
     render_size: ClassVar[tuple[int, int]] = (600, 400)
     """Width and height of the pictures in pixels."""
 
+    _was_reset: bool = False
+    _renderer: Renderer[Any] | None = None
+    """Draws the pictures, once there are any."""
+
+    _pictured: tuple[float | None, float] = None, 0.0
+    """The reward and the return that a picture shows."""
+
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
@@ -62,11 +69,11 @@ class Pictured(Hooks):
         if self.render_mode is None:
             gymnasium.logger.warn("render was called, but no render_mode was given at construction")
             return None
-        if not self.inside.was_reset:
+        if not self._was_reset:
             raise SimulationError("render was called before the first reset")
-        if self.inside.renderer is None:
-            self.inside.renderer = self._make_renderer(self.render_mode)
-        return self.inside.renderer.render(self._get_frame(), self._overlay())
+        if self._renderer is None:
+            self._renderer = self._make_renderer(self.render_mode)
+        return self._renderer.render(self._get_frame(), self._overlay())
 
     def _make_renderer(self, mode: str) -> Renderer[Any]:
         from fmugym.rendering import Renderer  # pygame takes a while to import
@@ -74,7 +81,7 @@ class Pictured(Hooks):
         scene = self._get_scene()
         if not callable(getattr(scene, "draw", None)):
             raise ConfigError(f"_get_scene returned {shown(scene)}, expected a scene with 'draw'")
-        fps = 1 / self.inside.interface.time_step
+        fps = 1 / self.interface.time_step
         return Renderer(scene, self.render_size, fps, mode, type(self).__name__)
 
     def _overlay(self) -> Overlay:
@@ -83,11 +90,11 @@ class Pictured(Hooks):
         action = self._describe_action() if self.step_count else ""
         if not isinstance(action, str):
             raise ConfigError(f"_describe_action returned {shown(action)}, expected text")
-        return Overlay(self.time, action, *self.inside.pictured)
+        return Overlay(self.time, action, *self._pictured)
 
 
 def note_for_picture(env: Pictured, reward: float) -> None:
     """Note the reward of a step of an environment with pictures; a window shows it at once."""
-    env.inside.pictured = reward, env.inside.pictured[1] + reward
+    env._pictured = reward, env._pictured[1] + reward
     if env.render_mode == "human":
         env.render()

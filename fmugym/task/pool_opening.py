@@ -22,7 +22,7 @@ from fmugym.errors import ConfigError
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.systems import FMUSystem
-from fmugym.task.episode import EpisodeDraws
+from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.starting import structural_values
 from fmugym.trial.opening import make_pool
 
@@ -161,7 +161,7 @@ class PoolOpening:
     fmu: FMU
     spec: PoolSpec
     config: EnvConfig
-    draws: EpisodeDraws
+    draws: EpisodeStart
     log: logging.Logger
     backend: Any
     isolation: str | None

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+import hashlib
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -15,7 +18,7 @@ from fmugym.pool import Pool
 from fmugym.pool.extension import needs_engine
 from fmugym.task.construction import Constructed
 from fmugym.task.plain import changed, plain_attributes
-from fmugym.task.snapshot import Column, Columns
+from fmugym.task.snapshot import Column, Columns, Scope
 
 __all__ = [
     "READ",
@@ -27,10 +30,15 @@ __all__ = [
     "require_quantities",
     "require_saving",
     "row_of",
+    "scope_of",
     "state_of",
 ]
 
 _WORD: Final = 2**64
+
+_OPERATION: Final = {"on_fault", "fault_retries", "fault_reward", "isolation", "foreign"}
+"""Config keys on which no state depends."""
+
 READ: Final = tuple(one.attribute for one in KEPT)
 """The quantities but for mappings."""
 
@@ -59,10 +67,10 @@ def columns_of(env: Constructed) -> Columns:
     require_quantities(env)
     streams, seeds = _stream_of(env)
     return read_columns(env, lambda value: [copy.deepcopy(value)]) | {
-        "ended": np.array([env.inside.ended]),
+        "ended": np.array([env._ended]),
         "streams": streams,
         "seeds": seeds,
-        "pictured": [env.inside.pictured],
+        "pictured": [env._pictured],
     }
 
 
@@ -72,8 +80,8 @@ def require_quantities(env: Constructed) -> None:
     Raises:
         ConfigError: If such an attribute has changed since hooks are called.
     """
-    own = plain_attributes(vars(env), env.inside.own_names)
-    for name in changed(own, env.inside.as_constructed):
+    own = plain_attributes(vars(env), env._own_names)
+    for name in changed(own, env._as_constructed):
         raise ConfigError(
             f"the attribute {name!r} of {type(env).__name__} has changed since the first reset, "
             "and no snapshot holds it: keep it under 'episode_variables', which _update may write"
@@ -82,7 +90,7 @@ def require_quantities(env: Constructed) -> None:
 
 def note_attributes(env: Constructed) -> None:
     """Take the attributes of the class for those that it was made with."""
-    env.inside.as_constructed = plain_attributes(vars(env), env.inside.own_names)
+    env._as_constructed = plain_attributes(vars(env), env._own_names)
 
 
 def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
@@ -92,7 +100,7 @@ def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
         env: The environment, or the prototype of several.
         column: Copies a value, or those of several environments.
     """
-    columns: Columns = {name: column(getattr(env.inside.readings, name)) for name in READ}
+    columns: Columns = {name: column(getattr(env._episode, name)) for name in READ}
     groups = {"parameters": env.parameters, "variables": env.variables}
     for kind, values in groups.items():
         columns[kind] = {name: column(value) for name, value in values.items()}
@@ -113,7 +121,7 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
-    read = env.inside.readings
+    read = env._episode
     for one in KEPT:
         setattr(read, one.attribute, _kept_value(one, columns[one.attribute], place))
     read.state = read.outputs[: read.width]
@@ -123,9 +131,9 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
         {name: _native_value(column, place) for name, column in columns["variables"].items()}
     )
     pictured = columns["pictured"]
-    env.inside.pictured = (None, 0.0) if pictured is None else pictured[place]
+    env._pictured = (None, 0.0) if pictured is None else pictured[place]
     _place_stream(env, columns, place)
-    env.inside.was_reset, env.inside.ended = True, bool(columns["ended"][place])
+    env._was_reset, env._ended = True, bool(columns["ended"][place])
 
 
 def _kept_value(quantity: EpisodeQuantity, column: Any, place: int) -> Any:
@@ -188,3 +196,29 @@ def state_of(row: list[int]) -> dict[str, Any]:
     high, low, increment_high, increment_low, has_half, half = row
     numbers = {"state": high * _WORD + low, "inc": increment_high * _WORD + increment_low}
     return {"bit_generator": "PCG64", "state": numbers, "has_uint32": has_half, "uinteger": half}
+
+
+def scope_of(env: Constructed) -> Scope:
+    """What a snapshot's environment must have in common with this one."""
+    if env._scope is None:
+        env._scope = _find_scope(env)
+    return env._scope
+
+
+def _find_scope(env: Constructed) -> Scope:
+    config, fmu = env.config, env.fmu.description
+    scope = {
+        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} (SHA-256 {env.fmu.content})",
+        "action space": str(env.action_space),
+    }
+    names = [f.name for f in fields(config) if f.name not in _OPERATION]
+    return scope | {f"config key {name!r}": _text(getattr(config, name)) for name in names}
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key!r}: {_text(part)}' for key, part in value.items())}}}"
+    if isinstance(value, np.ndarray):
+        digest = hashlib.sha256(value.tobytes()).hexdigest()[:16]
+        return f"array of {value.dtype}, shape {value.shape}, content {digest}"
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))

@@ -5,18 +5,14 @@ from __future__ import annotations
 import hashlib
 import pickle
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-
-if TYPE_CHECKING:
-    from fmugym.task.construction import Constructed
 
 __all__ = [
     "Column",
@@ -25,16 +21,12 @@ __all__ = [
     "Snapshot",
     "checked_snapshot",
     "require_scope",
-    "scope_of",
     "stacked",
     "taken",
 ]
 
 _VERSION: Final = 4
 """Of pickles; it changes with their content."""
-
-_OPERATION: Final = {"on_fault", "fault_retries", "fault_reward", "isolation", "foreign"}
-"""Config keys on which no state depends."""
 
 _HASH: Final = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{8,}\b")
 
@@ -260,29 +252,3 @@ def _different_parts(one: str, other: str) -> tuple[str, str]:
 def _shown(text: str) -> str:
     """A text of a scope on one line, with the first digits of each hash."""
     return shown(_HASH.sub(r"\1...", text))[1:-1]
-
-
-def scope_of(env: Constructed) -> Scope:
-    """What a snapshot's environment must have in common with this one."""
-    if env.inside.scope is None:
-        env.inside.scope = _find_scope(env)
-    return env.inside.scope
-
-
-def _find_scope(env: Constructed) -> Scope:
-    config, fmu = env.config, env.fmu.description
-    scope = {
-        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} (SHA-256 {env.fmu.content})",
-        "action space": str(env.action_space),
-    }
-    names = [f.name for f in fields(config) if f.name not in _OPERATION]
-    return scope | {f"config key {name!r}": _text(getattr(config, name)) for name in names}
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key!r}: {_text(part)}' for key, part in value.items())}}}"
-    if isinstance(value, np.ndarray):
-        digest = hashlib.sha256(value.tobytes()).hexdigest()[:16]
-        return f"array of {value.dtype}, shape {value.shape}, content {digest}"
-    return re.sub(r" at 0x[0-9a-fA-F]+", "", repr(value))

@@ -33,11 +33,11 @@ class EpisodeLimit:
     @classmethod
     def of(cls, env: Any) -> EpisodeLimit:
         """That of an environment; nothing may be longer than the episodes of a declared task."""
-        inside, length = env.inside, env.config.max_episode_steps
-        if inside.quantities is None or length is None:
-            return cls(inside.step_limit)
-        seconds = length * inside.spec.time_step
-        return cls(inside.step_limit, length, f"the task's 'episode_length' of {seconds:g} s")
+        length = env.config.max_episode_steps
+        if env.resolved is None or length is None:
+            return cls(env.step_limit)
+        seconds = length * env.pool_spec.time_step
+        return cls(env.step_limit, length, f"the task's 'episode_length' of {seconds:g} s")
 
     def shortened(self, max_episode_steps: int | None) -> EpisodeLimit:
         """The same, unless another limit is shorter.

@@ -198,4 +198,4 @@ def start_time_of(env: Any) -> Any:
     """The first communication point of an environment's episode, in s; or of N as hooks read it."""
     if env.config.draws_start_time:
         return env.parameters["start_time"]
-    return env.inside.spec.start_time
+    return env.pool_spec.start_time

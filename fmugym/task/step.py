@@ -83,7 +83,7 @@ def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) 
     Returns:
         The observation as the hook returned it, the reward, terminated and truncated.
     """
-    own = env.inside.own
+    own = env._own_hooks
     if own.update:
         form.update(env)
     done = env._is_done()
@@ -91,7 +91,7 @@ def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) 
         done = form.flags("_is_done", done)
     if stopped is not False:
         done = done | stopped
-    env.inside.readings.done = done
+    env._episode.done = done
     if own.is_truncated:
         cut_off = form.flags("_is_truncated", env._is_truncated()) | cut_off
     if observed is None:

@@ -18,7 +18,7 @@ from fmugym.pool import Pool
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.licences import require_started
 from fmugym.pool.state_files import StateFiles, essence
-from fmugym.task.readings import Readings, reading
+from fmugym.task.episode import Episode, standing_in
 from fmugym.task.spaces import to_input_types
 from fmugym.trial.known import state_files
 
@@ -36,7 +36,7 @@ _FAILED: Final = "the warm-up failed: "
 class WarmUp(ABC):
     """What happens in a warm-up.
 
-    Its methods read the environment as hooks do. The readings are arrays with M environments on the
+    Its methods read the environment as hooks do. The episodes are arrays with M environments on the
     last axis, also in a single environment. ``step_count`` rises to 0.
 
     Attributes:
@@ -115,7 +115,7 @@ class WarmUps:
         self._env, self.warm_up = env, warm_up
         starts = env.config.variable_starts
         self._shapes = {name: np.shape(starts[name]) for name in warm_up.writes}
-        sizes = len(env.inside.interface.inputs), *map(math.prod, self._shapes.values())
+        sizes = len(env.interface.inputs), *map(math.prod, self._shapes.values())
         self._ends = np.cumsum(sizes)
         self._size = 8 * int(self._ends[-1])  # of the bytes before an FMU's state
         self._prefix: str | None = None
@@ -184,7 +184,7 @@ class WarmUps:
     def _key(self, parts: Iterable[bytes]) -> bytes:
         if self._prefix is None:
             self._prefix = state_files(self._env.fmu)
-            spec = repr(essence(self._env.inside.spec))
+            spec = repr(essence(self._env.pool_spec))
             self._scope = f"{self._prefix} {spec} {self.warm_up.digest}".encode()
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
@@ -209,24 +209,24 @@ class WarmUps:
 
     # Warm-ups
 
-    def _run(self, pool: Pool, readings: Readings, indices: IndexArray) -> Mapping[str, Any]:
+    def _run(self, pool: Pool, episodes: Episode, indices: IndexArray) -> Mapping[str, Any]:
         """Do the warm-up of episodes that have just begun; return what variables it has written."""
         skip = np.ones(pool.num_instances, np.bool_)
         skip[indices] = False
-        variables = self._play(pool, readings, indices, skip)
+        variables = self._play(pool, episodes, indices, skip)
         self._keep(pool, variables, indices)
         return variables
 
     def _play(
         self,
         pool: Pool,
-        readings: Readings,
+        episodes: Episode,
         indices: IndexArray,
         skip: npt.NDArray[np.bool_],
     ) -> dict[str, Any]:
         count, warm_up = len(indices), self.warm_up
         warm_up.begin(count)
-        with reading(self._env, readings), np.errstate(all="ignore"):
+        with standing_in(self._env, episodes), np.errstate(all="ignore"):
             env: Any = self._env
             for step in range(-warm_up.steps, 0):
                 env.step_count = np.full(count, step)
@@ -237,19 +237,19 @@ class WarmUps:
 
     def _step(self, pool: Pool, indices: IndexArray, skip: npt.NDArray[np.bool_]) -> None:
         env: Any = self._env
+        env._episode.keep()
         given = np.empty((len(pool.inputs), len(indices)))
         for row, value in zip(given, self.warm_up.inputs(env), strict=True):
             row[:] = value
-        if not env.inside.input_writer.all_real:
-            columns = [to_input_types(env.inside.interface.inputs, column) for column in given.T]
+        if not env._conversions.input_writer.all_real:
+            columns = [to_input_types(env.interface.inputs, column) for column in given.T]
             given = np.array(columns).T
         env.inputs = given
         pool.inputs[:, indices] = given
-        env.previous_state = env.state
         pool.step(None, skip)
         require_started(pool, indices, _FAILED)
-        env.inside.readings.outputs = outputs = pool.outputs[:, indices]
-        env.state = outputs[: env.inside.output_count]
+        env._episode.outputs = outputs = pool.outputs[:, indices]
+        env.state = outputs[: env.interface.output_count]
 
     def _keep(self, pool: Pool, rows: Mapping[str, Any], indices: IndexArray) -> None:
         """Keep the states of those for which none was known."""

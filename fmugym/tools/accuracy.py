@@ -84,7 +84,7 @@ class Replay:
         """Play the beginning of an episode with random actions, and keep what the FMU got."""
         env.action_space.seed(0)
         env.reset(seed=0)
-        draws, pool = env.inside.draws, env.inside.pool
+        draws, pool = env.episode_start, env.pool
         pairs = zip(draws.model_variables, draws.parameter_names, strict=True)
         starts = [checked_value(variable, env.parameters[name]) for variable, name in pairs]
         inputs: list[Any] = []
@@ -98,7 +98,7 @@ class Replay:
         rows = np.array(inputs, np.float64).reshape(len(inputs), len(pool.inputs))
         if fails:  # with other settings it may go on
             rows = np.resize(rows, (_STEPS, len(pool.inputs)))
-        return cls(env.inside.opening, draws.model_variables, np.array([starts]).T, rows)
+        return cls(env.pool_opening, draws.model_variables, np.array([starts]).T, rows)
 
     @property
     def spec(self) -> PoolSpec:

@@ -84,7 +84,7 @@ def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) 
         raise ConfigError(f"--seconds must be positive, got {seconds:g}")
     load: float | None = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with closing(make_env()) as env:
-        time_step = env.inside.spec.time_step
+        time_step = env.pool_spec.time_step
         report = Report((_of_single(env, seconds),), time_step, _processors(), load)
     yield report
     for size in sizes:
@@ -108,7 +108,7 @@ def _of_single(env: FMUEnv, seconds: float) -> Speed:
     env.reset(seed=0)
     _fastest(step, seconds / 4)
     took = _fastest(step, seconds)
-    hooks = "Python" if env.inside.compiled_step is None else "expressions"
+    hooks = "expressions" if env.is_compiled else "Python"
     env.reset(seed=0)
     return Speed(0, hooks, 1.0 / took, took * 1e6, _share(env, seconds, took))
 
@@ -119,8 +119,8 @@ def _of_vector(make_env: Callable[[], FMUEnv], size: int, seconds: float) -> Spe
         actions = [envs.action_space.sample() for _ in range(16)]
         took = _fastest(lambda number: envs.step(actions[number % 16]), seconds)
         envs.reset(seed=0)
-        share = _share(envs.inside.prototype, seconds, took)
-        return Speed(size, envs.inside.engine.way, size / took, took * 1e6, share)
+        share = _share(envs.prototype, seconds, took)
+        return Speed(size, envs.engine.way, size / took, took * 1e6, share)
 
 
 def _fastest(step: Callable[[int], Any], seconds: float) -> float:
@@ -154,15 +154,15 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     The FMUs go on from the beginning of an episode with their first inputs, for as many steps as an
     episode may have, so that they stay near states that occur.
     """
-    pool = env.inside.pool
-    variables = tuple(env.inside.draws.model_variables)
+    pool = env.pool
+    variables = tuple(env.episode_start.model_variables)
     rng = np.random.default_rng(0)
-    limit = min(env.inside.step_limit, 1000)
+    limit = min(env.step_limit, 1000)
     best = float("inf")
     end = perf_counter() + seconds / 2
     try:
         while perf_counter() < end:
-            pool.reset(variables, env.inside.draws.draw_starts(rng, pool.num_instances))
+            pool.reset(variables, env.episode_start.draw_starts(rng, pool.num_instances))
             begin = perf_counter()
             for _ in range(limit):
                 pool.step(None)

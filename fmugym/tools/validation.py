@@ -34,6 +34,7 @@ from fmugym.fmi.words import asked_for
 from fmugym.search.probe import MOST_PROBED
 from fmugym.search.search import tuning_steps
 from fmugym.series.choice import quantities_of
+from fmugym.task.own_hooks import is_overridden
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import advise
@@ -224,7 +225,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_repetition(env, first)
     pairs = {
         name: [_play(env, _always(value)) for value in ends]
-        for name, *ends in _extremes(env.action_space, env.inside.interface.input_names)
+        for name, *ends in _extremes(env.action_space, env.interface.input_names)
     }
     yield from _of_actions(env, pairs)
     yield from _of_parameters(env)
@@ -343,7 +344,7 @@ def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
 
 def _numbers_of(env: FMUEnv, name: str) -> dict[str, Any]:
     """What a parameter is, by scalars; nothing for Strings and structural parameters."""
-    known = env.inside.interface.parameters
+    known = env.interface.parameters
     scalars = env.fmu.description.scalars(name)
     return {v.name: known[v.name] for v in scalars if v.name in known}
 
@@ -380,7 +381,7 @@ def _two_values(env: FMUEnv, name: str, value: Any) -> list[Any]:
 
 def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
     """Tell the inputs of the FMU that nobody writes."""
-    interface = env.inside.interface
+    interface = env.interface
     written = {*interface.input_names, *interface.parameters}
     idle = [
         variable.name
@@ -576,7 +577,7 @@ def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
     texts, names = named_controllers(given), env.action_names or ()
     wrong, moved = _tried(env, task, texts) if texts else ([], set[str]())
     yield from wrong
-    most = MOST_PROBED + tuning_steps(most_steps_of(env), not env.inside.draws.drawn_names)
+    most = MOST_PROBED + tuning_steps(most_steps_of(env), not env.episode_start.drawn_names)
     steps = f"{most:,} steps at most"
     if texts and not wrong:
         tuned = ", ".join(name for name, one in texts.items() if has_range(one))
@@ -647,8 +648,7 @@ def _moved(controller: Controller | None, names: Sequence[str]) -> Sequence[str]
 
 def _of_hooks(env: FMUEnv) -> Iterator[Finding]:
     """Tell whether the hooks of a class work on arrays, and whether the class says so."""
-    own = env.inside.own
-    if own.step or own.reset or not own_hooks(env):
+    if is_overridden(env, "step") or is_overridden(env, "reset") or not own_hooks(env):
         return
     difference, hook = no_arrays(env) or find_difference(env), hook_of_one(type(env))
     if difference is None and hook is None:
@@ -681,4 +681,4 @@ def _hooks(make_env: Callable[[], FMUEnv]) -> str:
     except FMUGymError:
         return "none"
     envs.close()
-    return envs.inside.engine.way
+    return envs.engine.way

@@ -12,7 +12,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool.base import FloatArray
 from fmugym.task.construction import draws_of
-from fmugym.task.readings import READINGS
+from fmugym.task.episode import READABLE
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.engines.engine import Engine
@@ -23,9 +23,10 @@ __all__ = ["Attributes", "require_settable"]
 _TOGETHER: Final = frozenset({"close", "reset", "step"})
 """Methods that one environment cannot do alone."""
 
-_KEPT_FOR_ALL: Final = frozenset(READINGS) | {
+_KEPT_FOR_ALL: Final = frozenset(READABLE) | {
     *("action_space", "config", "fmu", "logger", "metadata", "observation_space"),
-    *("render_mode", "spec"),
+    *("render_mode", "spec", "interface", "pool_spec", "pool_opening", "pool", "episode_start"),
+    *("formulas", "resolved", "step_limit", "warm_up", "warm_up_steps", "planning_model"),
 }
 """Attributes that ``FMUEnv`` sets itself."""
 
@@ -85,12 +86,12 @@ class Attributes:
             return [None for _ in indices]
         if not self._episodes.started:
             raise SimulationError("render was called before the first reset")
-        first, pictures = self._prototype.inside, []
+        first, pictures = self._prototype, []
         for index in indices:
             with self._engine.single(index) as env:
-                env.inside.renderer = env.inside.renderer or first.renderer
+                env._renderer = env._renderer or first._renderer
                 pictures.append(env.render())
-                first.renderer = env.inside.renderer
+                first._renderer = env._renderer
         return pictures
 
     def set(self, name: str, values: Any) -> None:
@@ -147,7 +148,7 @@ class Attributes:
         }
         for variable, column in columns.items():
             for value in column.tolist():
-                self._prototype.inside.interface.within(variable, value)
+                self._prototype.interface.within(variable, value)
         for variable, column in columns.items():
             self._engine.set_parameter(variable.name, column)
 
@@ -163,7 +164,7 @@ class Attributes:
         """
         env, names = self._prototype, [*self._prototype.fmu.description.variables]
         if name in env.variables:
-            drawn = name in env.inside.draws.drawn_names
+            drawn = name in env.episode_start.drawn_names
             if drawn and len(values) < len(self._engine.ended):
                 raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
             present = [self._engine.read(name, i) for i in range(len(self._engine.ended))]

@@ -76,7 +76,7 @@ def require_own_order(env: FMUEnv) -> None:
     Raises:
         ConfigError: If it overrides ``step`` or ``reset``.
     """
-    own, name = env.inside.own, type(env).__name__
+    own, name = env._own_hooks, type(env).__name__
     if own.step or own.reset:
         method = "step" if own.step else "reset"
         raise ConfigError(

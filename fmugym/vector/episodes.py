@@ -13,7 +13,8 @@ from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.task.snapshot import Columns, Snapshot, checked_snapshot, scope_of
+from fmugym.task.saving import scope_of
+from fmugym.task.snapshot import Columns, Snapshot, checked_snapshot
 from fmugym.vector.engines.engine import Engine
 from fmugym.vector.rollouts import (
     Candidates,

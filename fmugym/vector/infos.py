@@ -13,8 +13,8 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.task.episode import EpisodeDraws
-from fmugym.task.readings import environments_first
+from fmugym.task.episode import environments_first
+from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.codec import coded, mapped, within
 
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 
-def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+def drawn_info(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
     """The info of a reset.
 
     Args:
@@ -44,12 +44,12 @@ def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[
     return {"drawn": LateDict.of(_told, draws, of_all, mask), "_drawn": mask}  # rarely read
 
 
-def late_info(draws: EpisodeDraws) -> tuple[Any, ...]:
+def late_info(draws: EpisodeStart) -> tuple[Any, ...]:
     """How the C extension makes ``"drawn"`` of ``drawn_info`` from drawn values and a mask."""
     return LateDict, UNFILLED, partial(_told, draws)
 
 
-def _told(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+def _told(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
     told = draws.told | draws.shown(drawn)
     kinds = {name: object if name in draws.strings else None for name in told}
     return coded({n: _of_each(v, len(mask), kinds[n]) for n, v in told.items()}, mask)

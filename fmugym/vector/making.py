@@ -31,7 +31,7 @@ def make_with_pool(make_env: Callable[[], Any], num_instances: int = 1, **option
     """
     env = EnvMaker(make_env).make()
     require_construction(env)
-    env.inside.use(env.inside.opening.open(num_instances, **options))
+    env._use(env.pool_opening.open(num_instances, **options))
     return env
 
 
@@ -62,12 +62,12 @@ class EnvMaker:
             raise ConfigError(
                 f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
             )
-        if env.inside.number < first:
+        if env._number < first:
             raise ConfigError(
                 "make_env must make a new environment in each call, but it returned a "
                 f"{type(env).__name__} that was there before; let it call the class"
             )
-        env.inside.close_pool()  # of a constructor that has used it, or in another thread
+        env._close_pool()  # of a constructor that has used it, or in another thread
         return env
 
     def make_like(self, prototype: FMUEnv, index: int) -> FMUEnv:
@@ -91,7 +91,7 @@ def _differences(first: FMUEnv, second: FMUEnv) -> dict[str, bool]:
     return {
         "class": type(first) is not type(second),
         "FMU": first.fmu.path != second.fmu.path,
-        "interface to the FMU": not _are_equal(first.inside.spec, second.inside.spec),
+        "interface to the FMU": not _are_equal(first.pool_spec, second.pool_spec),
         "action space": first.action_space != second.action_space,
         "observation space": first.observation_space != second.observation_space,
     }

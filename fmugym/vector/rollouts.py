@@ -22,6 +22,7 @@ from fmugym.checks import (
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.future import future_of
 from fmugym.task.snapshot import Columns
 from fmugym.vector.action_arrays import array_of, checked_actions, is_array_space
 from fmugym.vector.codec import mapped
@@ -246,7 +247,8 @@ def tables_of(env: FMUEnv, data: Any) -> dict[str, FloatArray]:
         ConfigError: If there is no such data, or the rows make no function of time.
     """
     given = {} if data is None else check_mapping("'data'", data)
-    lookups = {} if env.inside.future is None else env.inside.future.lookups
+    future = future_of(env)
+    lookups = {} if future is None else future.lookups
     given = by_own_names("'data'", given, Spellings("data that hooks read", lookups).require)
     return {name: lookups[name].table_of(name, rows) for name, rows in given.items()}
 
@@ -284,7 +286,7 @@ def keys_of(env: FMUEnv, seed: Any) -> dict[str, float]:
     Raises:
         ConfigError: If it is no seed.
     """
-    first, future = check_seed(seed), env.inside.future
+    first, future = check_seed(seed), future_of(env)
     if first is None or future is None:
         return {}
     stream = np.random.default_rng(first)

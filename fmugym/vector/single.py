@@ -18,7 +18,7 @@ from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.views import ColumnReadings, batched
+from fmugym.vector.views import EpisodeColumn, batched
 
 __all__ = ["ExpressionStep", "expression_step_of"]
 
@@ -57,8 +57,8 @@ class ExpressionStep:
     """
 
     def __init__(self, env: FMUEnv, task: TaskPrograms) -> None:
-        pool, draws = env.inside.pool, env.inside.draws
-        rows = batched(env, 1, pool.outputs, pool.inputs)
+        pool, draws = env._instance.pool, env.episode_start
+        rows = batched(env, 1, pool)
         starts = draws.constants[:, None].copy()
         if task.inputs.loads("parameter") or task.judgement.loads("parameter"):
             numbers = zip(draws.parameter_names, starts, strict=True)
@@ -71,21 +71,21 @@ class ExpressionStep:
             task,
             starts,
             (no_draws(), (), np.zeros((1, 6), np.uint64)),
-            env.inside.step_limit,
+            env.step_limit,
             (tuple, form, (), shapes, (None,) * 3),
         )
         self._play: Any = play.step
         self._updated = task.updated
-        self._take_over(env, ColumnReadings(rows, 0))
+        self._take_over(env, EpisodeColumn(rows, 0))
 
-    def _take_over(self, env: FMUEnv, readings: ColumnReadings) -> None:
+    def _take_over(self, env: FMUEnv, readings: EpisodeColumn) -> None:
         """Let the environment read from the arrays what it reads now."""
-        own = env.inside.readings
+        own = env._episode
         for name in READ:
             setattr(readings, name, getattr(own, name))
         readings.parameters = own.parameters
         readings.variables.update(own.variables)
-        env.inside.readings = readings
+        env._episode = readings
 
     def step(self, env: FMUEnv, action: Any) -> Result:
         """Do a step.
@@ -94,8 +94,7 @@ class ExpressionStep:
             ConfigError: If the action does not fit, or the inputs that it makes are not finite.
             SimulationError: After a fault with ``on_fault="raise"``.
         """
-        inside = env.inside
-        inside.ended = True  # until the step is done: after an exception no episode goes on
+        env._ended = True  # until the step is done: after an exception no episode goes on
         try:
             result, troubled, ended, _ = self._play(action, False)
         except _REFUSALS as error:
@@ -106,7 +105,7 @@ class ExpressionStep:
         if ended:
             self._memory.ended[0] = False  # a reset begins the next episode, not the pool
         else:
-            inside.ended = False
+            env._ended = False
         seen, reward, terminated, truncated, info = result
         if self._divided is not None:
             seen, info = self._divided(seen)
@@ -114,24 +113,26 @@ class ExpressionStep:
 
     def _play_element(self, env: FMUEnv, action: Any) -> Any:
         """Do a step with an action that the pool has refused in its own type or shape."""
-        env.inside.ended = False
+        env._ended = False
         element = as_element(env, action)
-        env.inside.ended = True
+        env._ended = True
         return self._play(element if element.shape else element.item(), False)
 
     def _judge_again(self, env: FMUEnv) -> Result:
         """Judge a step in Python, whose status or a number is not good, from before it on."""
-        inside, memory, read = env.inside, self._memory, env.inside.readings
+        memory, read, conversions = self._memory, env._episode, env._conversions
         values, read.outputs = read.outputs, memory.kept[:, 0]
         for name in self._updated:
             memory.variables[name][...] = memory.before[name]
         read.done, memory.ended[0] = False, False
-        if not np.isfinite(inside.input_row).all():
+        if not np.isfinite(env._instance.inputs).all():
             read.step_count -= 1
-            inside.input_writer.checked(env._get_inputs(), read.action)  # it says what is wrong
-        if inside.pool_observes:
+            conversions.input_writer.checked(
+                env._get_inputs(), read.action
+            )  # it says what is wrong
+        if conversions.pool_observes:
             with np.errstate(over="ignore"):  # what is infinite then is a fault
-                inside.observation_row[:] = values[: inside.output_count]
-        result = judged(env, inside.pool.statuses.item(0), values)
-        inside.ended = result[2] or result[3]
+                env._instance.observation[:] = values[: env.interface.output_count]
+        result = judged(env, env._instance.pool.statuses.item(0), values)
+        env._ended = result[2] or result[3]
         return result

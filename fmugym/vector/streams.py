@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import IndexArray
-from fmugym.task.episode import EpisodeDraws
+from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.saving import row_of, state_of
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class EpisodeStreams:
         words = np.frombuffer(b"".join([s.to_bytes(size, "little") for s in seeds]), "<u4")
         _native.seed(self.states, np.array(indices), words.astype(np.uint32).tobytes())
 
-    def draw(self, draws: EpisodeDraws, indices: IndexArray) -> FloatArray:
+    def draw(self, draws: EpisodeStart, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
 
         Returns:

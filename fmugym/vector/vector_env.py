@@ -14,7 +14,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
 from fmugym.checks import check_count, check_misplaced
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.pool import Pool
 from fmugym.pool.base import MaskArray
 from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
@@ -29,7 +31,7 @@ from fmugym.vector.arguments import (
 )
 from fmugym.vector.attributes import Attributes
 from fmugym.vector.choosing import make_engine, require_own_order
-from fmugym.vector.engines.engine import StepResult
+from fmugym.vector.engines.engine import Engine, StepResult
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import final_infos, last_observations, merged, restricted
 from fmugym.vector.making import EnvMaker
@@ -42,7 +44,6 @@ from fmugym.vector.rollouts import (
     tables_of,
     tunable_values,
 )
-from fmugym.vector.vector_inside import VectorInside
 from fmugym.vector.vector_saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv", "require_open"]
@@ -77,6 +78,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     Attributes:
         autoreset_mode: What follows the end of an episode; ``metadata`` has it, too.
+        prototype: The first of the environments, whose task all have.
+        pool: Has the FMUs.
+        engine: Has the quantities of the episodes, and calls the hooks.
+        episodes: Saves, restores and tries out episodes.
+        attributes: Reads, sets and calls what single environments have.
+        maker: Makes environments of the same class.
 
     Raises:
         ConfigError: If an argument does not fit, or the class overrides ``step`` or ``reset``. For
@@ -87,13 +94,21 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012  (as in FMUEnv)
 
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
-    inside: VectorInside
+
+    prototype: FMUEnv
+    pool: Pool
+    engine: Engine
+    episodes: Episodes
+    attributes: Attributes
+    maker: EnvMaker
+
+    _limit: EpisodeLimit
+    _at_ends: tuple[Callable[[Any], None], ...] = ()
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUVectorEnv:
         """Keep the arguments for copies."""
         env = super().__new__(cls)
         env._arguments = args, kwargs
-        env.inside = VectorInside()
         return env
 
     def __init__(
@@ -115,9 +130,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         limit = None if limit is None else check_count("max_episode_steps", limit)
         options = checked_pool_options(pool_options, self.num_envs)
         try:
-            self.inside.maker = EnvMaker(make_env)
-            self.inside.prototype = self.inside.maker.make()
-            require_construction(self.inside.prototype)
+            self.maker = EnvMaker(make_env)
+            self.prototype = self.maker.make()
+            require_construction(self.prototype)
             self._set_up_or_close(limit, options)
         except MemoryError:
             raise ConfigError(f"there is not enough memory for num_envs = {num_envs}") from None
@@ -125,25 +140,25 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _set_up_or_close(
         self, max_episode_steps: int | None, pool_options: Mapping[str, Any]
     ) -> None:
-        env = self.inside.prototype
+        env = self.prototype
         try:
             require_own_order(env)
-            self.inside.pool = env.inside.opening.open(
+            self.pool = env.pool_opening.open(
                 self.num_envs, max_episode_steps=max_episode_steps, **pool_options
             )
             try:
-                env.inside.use(self.inside.pool)
+                env._use(self.pool)
                 self._set_up(max_episode_steps)
             except BaseException:
-                self.inside.pool.close()
+                self.pool.close()
                 raise
         except BaseException:
             env.close()
             raise
 
     def _set_up(self, max_episode_steps: int | None) -> None:
-        inside, env, count = self.inside, self.inside.prototype, self.num_envs
-        inside.limit = EpisodeLimit.of(env).shortened(max_episode_steps)
+        env, count = self.prototype, self.num_envs
+        self._limit = EpisodeLimit.of(env).shortened(max_episode_steps)
         prepare_hooks(env)  # its constructor may have changed the spaces
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = env.render_mode
@@ -154,10 +169,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
         self.closed = False  # which each step reads: faster here than in the class
         self._background = Background()
-        inside.engine = make_engine(inside.maker, env, inside.pool, max_episode_steps)
-        inside.episodes = Episodes(env, inside.engine, inside.pool)
-        inside.attributes = Attributes(env, inside.engine, inside.episodes)
-        inside.engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
+        self.engine = make_engine(self.maker, env, self.pool, max_episode_steps)
+        self.episodes = Episodes(env, self.engine, self.pool)
+        self.attributes = Attributes(env, self.engine, self.episodes)
+        self.engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
 
     # Episodes and steps.
 
@@ -185,25 +200,25 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         check_misplaced(misplaced)
         if self.closed or self._background.is_pending:
             require_open(self, "reset")
-        if seed is None and self.inside.episodes.is_ready:
+        if seed is None and self.episodes.is_ready:
             try:
-                result = self.inside.engine.reset_by(options)
+                result = self.engine.reset_by(options)
             except BaseException:
                 self._interrupt()
                 raise
             if result is not None:
                 return result
         remaining, mask = split_options(options, self.num_envs)
-        if not self.inside.episodes.is_ready and not mask.all():
-            when = "reset after an exception" if self.inside.episodes.started else "first reset"
+        if not self.episodes.is_ready and not mask.all():
+            when = "reset after an exception" if self.episodes.started else "first reset"
             raise ConfigError(f"the {when} must be of all environments")
         seeds = None if seed is None else checked_seeds(seed, self.num_envs)
         try:
-            observations, infos = self.inside.engine.reset(mask, seeds, remaining)
+            observations, infos = self.engine.reset(mask, seeds, remaining)
         except BaseException:
             self._interrupt()
             raise
-        self.inside.episodes.started = self.inside.episodes.is_ready = True
+        self.episodes.started = self.episodes.is_ready = True
         return observations, infos
 
     def step(self, actions: Any) -> StepResult:
@@ -245,7 +260,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._require_ready("step_around", ended=True)
         try:
-            return self.inside.engine.step(actions, None, resting)
+            return self.engine.step(actions, None, resting)
         except BaseException:  # as in a single environment
             self._interrupt()
             raise
@@ -293,28 +308,27 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _require_ready(self, method: str, *, ended: bool = False) -> None:
         """Refuse a call before the first reset and so on; ``ended`` episodes may be allowed."""
-        if not self.inside.episodes.is_ready or self.closed or self._background.is_pending:
+        if not self.episodes.is_ready or self.closed or self._background.is_pending:
             require_open(self, method)
             when = "before the first reset"
-            if self.inside.episodes.started:
+            if self.episodes.started:
                 when = "after an exception that has ended all episodes; call reset first"
             raise SimulationError(f"{method} was called {when}")
-        engine = self.inside.engine
+        engine = self.engine
         if not ended and engine.any_ended and self._waits:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
     def _step(self, actions: Any, in_background: bool = False) -> StepResult:
-        inside = self.inside
-        engine = inside.engine
+        engine = self.engine
         any_ended = engine.any_ended
         is_busy = self._background.is_pending and not in_background
-        if not inside.episodes.is_ready or self.closed or is_busy or (any_ended and self._waits):
+        if not self.episodes.is_ready or self.closed or is_busy or (any_ended and self._waits):
             self._require_ready("step")
         try:
             result = engine.step(actions, engine.ended.copy() if any_ended else None)
             if engine.any_ended and self.autoreset_mode is _SAME_STEP:
-                for look in inside.at_ends:
+                for look in self._at_ends:
                     look(actions)
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment
@@ -324,14 +338,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _interrupt(self) -> None:
         """After an exception, end the episodes whose FMUs have stepped without a result."""
-        self.inside.pool.halt()
-        if self.inside.engine.has_moved:
-            self.inside.episodes.is_ready = False
+        self.pool.halt()
+        if self.engine.has_moved:
+            self.episodes.is_ready = False
 
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Start the next episodes in the step that ended some, where the engine has not."""
         last = last_observations(self.single_observation_space, result.observations, ended)
-        engine = self.inside.engine
+        engine = self.engine
         started = engine.reset_by({"reset_mask": ended})
         observations, infos = engine.reset(ended, None, {}) if started is None else started
         told = result.infos
@@ -339,6 +353,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if told:
             infos = merged(restricted(told, ~ended), infos)
         return result._replace(observations=observations, infos=infos)
+
+    def look_at_ends(self, look: Callable[[Any], None]) -> None:
+        """Call a function of the actions where episodes have ended and the next have not begun.
+
+        That moment is within a step in the mode ``SAME_STEP``.
+        """
+        self.engine.starts_at_ends = False
+        self._at_ends = (*self._at_ends, look)
 
     def render(self) -> tuple[Any, ...] | None:
         """Draw all environments.
@@ -352,7 +374,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         require_open(self, "render")
         if self.render_mode is None:
             return None
-        return tuple(self.inside.attributes.render(range(self.num_envs)))
+        return tuple(self.attributes.render(range(self.num_envs)))
 
     # Snapshots.
 
@@ -369,7 +391,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 the FMUs, or if an FMU fails.
         """
         self._require_ready("save_state", ended=True)
-        return self.inside.episodes.save(chosen(where, self.num_envs))
+        return self.episodes.save(chosen(where, self.num_envs))
 
     def restore_state(self, snapshot: Snapshot, where: Any = None) -> Any:
         """Let environments go on from a snapshot, with their random streams.
@@ -391,16 +413,16 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         require_open(self, "restore_state")
         indices = chosen(where, self.num_envs)
         sources = sources_for(checked_snapshot(snapshot), indices)
-        columns = self.inside.episodes.columns_of(snapshot)
-        if not self.inside.episodes.is_ready and len(indices) < self.num_envs:
+        columns = self.episodes.columns_of(snapshot)
+        if not self.episodes.is_ready and len(indices) < self.num_envs:
             raise ConfigError("before a reset of all, a snapshot must be restored in all")
-        self.inside.engine.require_fit(columns)
-        require_saving(self.inside.pool)
-        self.inside.episodes.is_ready = False
-        self.inside.episodes.restore(snapshot.bundle, sources, indices)
-        self.inside.engine.place(columns, sources, indices)
-        self.inside.episodes.started = self.inside.episodes.is_ready = True
-        return self.inside.engine.observe(indices)
+        self.engine.require_fit(columns)
+        require_saving(self.pool)
+        self.episodes.is_ready = False
+        self.episodes.restore(snapshot.bundle, sources, indices)
+        self.engine.place(columns, sources, indices)
+        self.episodes.started = self.episodes.is_ready = True
+        return self.engine.observe(indices)
 
     def rollout(
         self,
@@ -445,15 +467,15 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         require_open(self, "rollout")
         candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
-        prototype, count = self.inside.prototype, candidates.count
+        prototype, count = self.prototype, candidates.count
         candidates.parameters = tunable_values(prototype, parameters, count)
         candidates.tables = tables_of(prototype, data)
         candidates.offsets = offsets_of(prototype, offsets)
         candidates.variables = keys_of(prototype, seed)
-        present = self.save_state() if self.inside.episodes.is_ready else None
-        start = self.inside.episodes.start_of_rollout(snapshot, present, candidates.count)
-        with self.inside.episodes.returning_to(present):
-            return self.inside.episodes.roll_out(start, candidates)
+        present = self.save_state() if self.episodes.is_ready else None
+        start = self.episodes.start_of_rollout(snapshot, present, candidates.count)
+        with self.episodes.returning_to(present):
+            return self.episodes.roll_out(start, candidates)
 
     # Single environments.
 
@@ -465,7 +487,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: After ``close``.
         """
         require_open(self, "get_attr")
-        return tuple(self.inside.attributes.read(name, range(self.num_envs)))
+        return tuple(self.attributes.read(name, range(self.num_envs)))
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, an episode variable or a parameter of the FMU, of each environment.
@@ -483,7 +505,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: After ``close``.
         """
         require_open(self, "set_attr")
-        self.inside.attributes.set(name, values)
+        self.attributes.set(name, values)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -492,12 +514,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     @spec.setter
     def spec(self, value: EnvSpec | None) -> None:
-        vars(self)["spec"] = self.inside.limit.told_by(value)
+        vars(self)["spec"] = self._limit.told_by(value)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
-        return tuple(self.inside.engine.seed_of(index) for index in range(self.num_envs))
+        return tuple(self.engine.seed_of(index) for index in range(self.num_envs))
 
     @property
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
@@ -507,7 +529,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: After ``close``.
         """
         require_open(self, "health")
-        return self.inside.pool.health()
+        return self.pool.health()
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each environment, or read an attribute.
@@ -520,16 +542,16 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: After ``close``.
         """
         require_open(self, "call")
-        return tuple(self.inside.attributes.call(name, range(self.num_envs), args, kwargs))
+        return tuple(self.attributes.call(name, range(self.num_envs), args, kwargs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool, after waiting for a step that is under way."""
-        if hasattr(self.inside, "engine"):  # otherwise the constructor has closed everything
+        if "engine" in vars(self):  # otherwise the constructor has closed everything
             self._background.stop()
             try:
-                self.inside.engine.close()
+                self.engine.close()
             finally:
-                self.inside.pool.close()
+                self.pool.close()
 
     # Copies.
 
@@ -539,7 +561,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUVectorEnv:
         arguments = copy.deepcopy(self._arguments, memo)
         twin = _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
-        if self.inside.episodes.is_ready and not self.closed:
+        if self.episodes.is_ready and not self.closed:
             twin.restore_state(self.save_state())
         return twin
 
@@ -554,7 +576,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ) from None
 
     def __repr__(self) -> str:
-        return f"<FMUVectorEnv of {self.num_envs}: {self.inside.prototype!r}>"
+        return f"<FMUVectorEnv of {self.num_envs}: {self.prototype!r}>"
 
 
 def require_open(envs: FMUVectorEnv, method: str) -> None:

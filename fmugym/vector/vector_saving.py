@@ -12,7 +12,7 @@ from fmugym.checks import integer_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
-from fmugym.task.readings import environments_first, environments_last
+from fmugym.task.episode import environments_first, environments_last
 from fmugym.task.saving import READ, read_columns, require_quantities
 from fmugym.task.snapshot import Columns, Snapshot
 
@@ -100,7 +100,7 @@ def _rows(which: Which, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
     for name in READ:
-        place_column(getattr(env.inside.readings, name), columns[name], sources, which)
+        place_column(getattr(env._episode, name), columns[name], sources, which)
 
 
 def place_column(row: npt.NDArray[Any], column: Any, sources: Which, which: Which) -> None:

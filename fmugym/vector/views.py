@@ -1,4 +1,4 @@
-"""The readings of a batch of N environments, and of one environment of it."""
+"""The quantities of N episodes, and of one of them."""
 
 from __future__ import annotations
 
@@ -11,28 +11,27 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.expressions.quantities import KEPT
-from fmugym.pool.base import FloatArray
-from fmugym.task.readings import Readings
+from fmugym.expressions.quantities import KEPT, PREVIOUS
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.task.episode import Episode
 from fmugym.task.values import EpisodeVariables, ParameterValues
 
-__all__ = ["ColumnReadings", "batched", "some", "take"]
+__all__ = ["EpisodeColumn", "batched", "keep_rows", "some", "start_numbers", "take"]
 
 
-def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) -> Readings:
-    """Make the readings of a batch: arrays with environments on the last axis, all zero.
+def batched(env: FMUEnv, count: int, pool: Pool | None = None) -> Episode:
+    """Make the quantities of N episodes: arrays with environments on the last axis, all zero.
 
     Args:
         env: The prototype.
         count: The number of environments.
-        outputs: The array of outputs and monitored variables, by default a new one.
-        inputs: The array of inputs, by default a new one.
+        pool: Has the arrays of some quantities; by default they are new, too.
     """
     space: Any = env.action_space
     shapes: dict[str, tuple[int, ...]] = {
         "outputs": (len(env.out),),
-        "states": (env.inside.output_count,),
-        "inputs": (len(env.inside.start_inputs),),
+        "states": (env.interface.output_count,),
+        "inputs": (len(env.interface.start_inputs),),
         "action": space.shape,
         "number": (),
     }
@@ -42,23 +41,23 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
         )
         for one in KEPT
     }
-    arrays |= {} if outputs is None else {"outputs": outputs}
-    arrays |= {} if inputs is None else {"inputs": inputs}
+    if pool is not None:
+        arrays |= {one.attribute: getattr(pool, one.array) for one in KEPT if one.array}
     variables = EpisodeVariables(env.config.variable_starts)
     variables.update({n: np.zeros((*np.shape(v), count)) for n, v in variables.items()})
-    starts = env.inside.draws.variable_starts
+    starts = env.episode_start.variable_starts
     variables.update({n: np.repeat(start, count, axis=-1) for n, start in starts.items()})
     values: Any = arrays["outputs"]
-    return Readings(
+    return Episode(
         env.out.over(lambda: values),
-        env.inside.output_count,
+        env.interface.output_count,
         parameters=MappingProxyType({}),
         variables=variables,
         **arrays,
     )
 
 
-def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> Readings:
+def some(batch: Episode, which: npt.NDArray[np.intp] | slice = slice(None)) -> Episode:
     """Return copies of what the hooks of some environments of a batch read, in the same form.
 
     Args:
@@ -66,6 +65,19 @@ def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> 
         which: Their indices, or a slice.
     """
     return batch.mapped(lambda values: np.array(np.asarray(values)[..., which]))
+
+
+def start_numbers(batch: Episode, which: Any) -> None:
+    """Set counts and flags of episodes that begin to zero."""
+    for one in KEPT:
+        if one.shape == "number":
+            getattr(batch, one.attribute)[which] = 0
+
+
+def keep_rows(batch: Episode, which: Any) -> None:
+    """Let quantities before the step be those of now, in some episodes."""
+    for name, now in PREVIOUS.items():
+        getattr(batch, name)[..., which] = getattr(batch, now)[..., which]
 
 
 def take(values: Any, index: int) -> Any:
@@ -77,10 +89,10 @@ def take(values: Any, index: int) -> Any:
 def _column_property(name: str, make: Callable[[npt.NDArray[Any]], Any]) -> Any:
     """A property that makes a value of an environment's part of an array, and writes there."""
 
-    def get(self: ColumnReadings) -> Any:
+    def get(self: EpisodeColumn) -> Any:
         return make(getattr(self.batch, name)[..., self.index])
 
-    def put(self: ColumnReadings, value: Any) -> None:
+    def put(self: EpisodeColumn, value: Any) -> None:
         getattr(self.batch, name)[..., self.index] = value
 
     return property(get, put)
@@ -98,20 +110,20 @@ _OF_COLUMN: Final[Mapping[str, Callable[[npt.NDArray[Any]], Any]]] = {
 """What makes a value of an environment's part of an array, by the shape of the quantity."""
 
 
-class ColumnReadings(Readings):
-    """The readings of one of N environments: its column of their arrays.
+class EpisodeColumn(Episode):
+    """The quantities of one of N episodes: its column of their arrays.
 
     Values are numbers of Python, made of the arrays when they are read. What is written goes to the
     arrays.
 
     Args:
-        batch: The readings of all.
+        batch: The quantities of all.
         index: The environment.
     """
 
     __slots__ = ("_parameters", "batch", "index")
 
-    def __init__(self, batch: Readings, index: int) -> None:
+    def __init__(self, batch: Episode, index: int) -> None:
         self.batch, self.index = batch, index
         self.width = batch.width
         self._parameters: Mapping[str, Any] | None = None  # as they were set
@@ -144,25 +156,25 @@ class ColumnReadings(Readings):
         parameters: Mapping[str, Any],
         variables: Mapping[str, Any],
     ) -> None:
-        """See ``Readings.begin``."""
+        """See ``Episode.begin``."""
         batch, index = self.batch, self.index
-        batch.inputs[:, index], batch.step_count[index] = inputs, 0
-        batch.action[..., index] = batch.previous_action[..., index] = action
-        batch.done[index] = batch.after_end[index] = False
+        batch.inputs[:, index] = inputs
+        batch.action[..., index] = action
+        start_numbers(batch, index)
         self.parameters = parameters
         for name, value in variables.items():
             row = batch.variables[name]
             row[index if row.ndim == 1 else (..., index)] = value
 
     def look(self, outputs: FloatArray) -> None:
-        """See ``Readings.look``; the arrays have the outputs already."""
-        self.batch.previous_state[:, self.index] = self.batch.state[:, self.index]
+        """See ``Episode.look``; the arrays have the outputs already."""
+        keep_rows(self.batch, self.index)
 
 
 for _quantity in KEPT:
     _property = _column_property(_quantity.attribute, _OF_COLUMN[_quantity.shape])
-    setattr(ColumnReadings, _quantity.attribute, _property)
-ColumnReadings.state = _column_property("state", _numbers)
+    setattr(EpisodeColumn, _quantity.attribute, _property)
+EpisodeColumn.state = _column_property("state", _numbers)
 
 
 class _ColumnVariables(EpisodeVariables):

@@ -44,7 +44,7 @@ def test_environments_without_a_job_are_not_touched():
     """Those that play are spread over all, as neighbours step in one thread or process."""
     with closing(Arena(PendulumEnv, most_steps=5)) as arena:
         played(arena, np.zeros(8), range(1))
-        pool = arena.open(8).inside.pool
+        pool = arena.open(8).pool
         before = pool.health()
         played(arena, [1.0, 2.0], range(1))
         after = pool.health()
@@ -67,8 +67,8 @@ def test_fmus_that_call_python_step_in_processes(isolation, example, tmp_path):
     make_env = partial(fmugym.load, tmp_path / "task.toml", physical=True)
     with closing(Arena(make_env, most_steps=10)) as arena:
         found = arena.play(lambda numbers: zones.ByHand(), np.zeros((2, 1)), range(2)).returns
-        assert isinstance(arena.open(4).inside.pool, ProcessPool) == (isolation is None)
+        assert isinstance(arena.open(4).pool, ProcessPool) == (isolation is None)
     with closing(Arena(partial(fmugym.load, path, physical=True), 1, 10)) as arena:
         alone = arena.play(lambda numbers: zones.ByHand(), np.zeros((2, 1)), range(2)).returns
-        assert not isinstance(arena.open(1).inside.pool, ProcessPool)
+        assert not isinstance(arena.open(1).pool, ProcessPool)
     assert np.array_equal(found, alone)

@@ -240,7 +240,7 @@ class TestFuture:
         task = wheel(observed=False, forecast=None, data={"wind": rows}, scenarios=scenarios)
         for scenario in (None, "frost"):
             env = env_of(partial(fmugym.load, task, scenario=scenario))
-            future = env.inside.future
+            future = env.resolved.future
             assert future.lookups["wind"].mean() < 2.99
             foresight = _Foresight(("q_dot",), future, DT, 3)
             _, values = foresight.ahead({"wind": {}}, 0, 0.0)["wind"]
@@ -259,7 +259,7 @@ class TestFuture:
             data={"wind": {"values": days.repeat(24).tolist(), "step": HOUR}},
             scenarios={"autumn": {"start": "09-01", "length": "2d"}},
         )
-        future = env_of(partial(fmugym.load, task, scenario=scenario)).inside.future
+        future = env_of(partial(fmugym.load, task, scenario=scenario)).resolved.future
         assert future.lookups["wind"].mean(future.held_out) == pytest.approx(1.0, abs=0.01)
 
     def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
@@ -322,7 +322,7 @@ class TestModel:
         actions, rewards = play(env_of(wheel()), controller, 12)
         assert actions[:3] == pytest.approx(np.ones((3, 1)), abs=0.05)
         assert np.abs(rewards[4:]).max() < 0.01
-        assert isinstance(controller._copies.inside.pool, SurrogatePool)
+        assert isinstance(controller._copies.pool, SurrogatePool)
 
     def test_a_surrogate_is_fitted_once_for_an_fmu_and_a_config(self, env_of, bound):
         controller = bound(model="surrogate", steps=200)
@@ -570,7 +570,7 @@ class TestFailures:
         observation, _ = env.reset(seed=0, options={"model_parameters": {"limit": true}})
         for step in range(10):
             action = mpc.act(observation)
-            statuses = mpc._copies.inside.pool.statuses
+            statuses = mpc._copies.pool.statuses
             assert statuses.size == 9
             assert (statuses <= WARNING_CODE).all()
             observation, _, _, truncated, info = env.step(action)

@@ -145,7 +145,7 @@ def test_the_pool_draws_files(load_in):
     scenarios = {"peak": {"start": "01-15", "length": "7d", "file": "w2022.csv"}}
     for begin in ("clock", "start_time"):
         env = load_in(task_of(**{"clock": None, begin: season, "scenarios": scenarios}))
-        assert env.inside.draws.native is not None
+        assert env.episode_start.native is not None
 
 
 class TestPatterns:
@@ -244,7 +244,7 @@ class TestScenarios:
         task = task_of(**SCENARIOS | {"clock": {"from": "01-01", "to": "12-31"}})
         task["episode_length"] = "1d"
         env = load_in(task)
-        future = env.inside.future
+        future = env.resolved.future
         values = np.array([price(year) for year in YEARS])
         kept = np.ones(values.shape, np.bool_)
         kept[1, 9:14] = kept[:, 24] = False

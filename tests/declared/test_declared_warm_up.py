@@ -60,7 +60,7 @@ def driven(task, controller, seed):
     observation, _ = env.reset(seed=seed)
     for _ in range(STEPS):
         observation, *_ = env.step(bound.act(observation))
-    result = env.inside.readings.outputs, env.inputs[0], observation[2]
+    result = env.episode.outputs, env.inputs[0], observation[2]
     env.close()
     return result
 
@@ -72,7 +72,7 @@ def test_it_leads_where_the_controller_leads_as_an_agent(controller, load):
     for seed in (3, 4):
         observation, _ = env.reset(seed=seed)
         expected = driven(HOUSE, controller or "schedule 00:00=0", seed)
-        assert (env.inside.readings.outputs, env.inputs[0], observation[2]) == expected
+        assert (env.episode.outputs, env.inputs[0], observation[2]) == expected
         assert env.time == 86400.0
         assert env.step_count == 0
 
@@ -109,8 +109,8 @@ def test_a_cascade_leads_where_it_leads_as_an_agent(variables, rescale, load):
         for _ in range(STEPS):
             chosen.append(controller.act(observation))
             observation, *_ = driven.step(chosen[-1])
-        wanted = [*driven.inside.readings.outputs, *driven.inputs]
-        found = [*env.inside.readings.outputs, *env.inputs]
+        wanted = [*driven.episode.outputs, *driven.inputs]
+        found = [*env.episode.outputs, *env.inputs]
         assert found == (pytest.approx(wanted, rel=1e-5) if rescale else wanted)
         assert {one[1] for one in chosen} == {50.0, 300.0}
         assert len({one[0] for one in chosen}) > 5
@@ -146,7 +146,7 @@ def test_a_thermostat_whose_arguments_the_task_tells(name, change, load):
     full = "hysteresis of=T setpoint=T_set band=0 below=1 above=0"
     env, same = load(house(name, **change)), load(house(full, **change))
     assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
-    assert env.inside.readings.outputs == same.inside.readings.outputs
+    assert env.episode.outputs == same.episode.outputs
 
 
 def test_named_controllers_and_constants():
@@ -192,10 +192,10 @@ def test_those_that_go_on_do_not_change(controller, make_envs):
     envs.reset(seed=2)
     envs.action_space.seed(1)
     envs.step(envs.action_space.sample())
-    before, outputs = envs.call("inputs"), envs.inside.pool.outputs.copy()
+    before, outputs = envs.call("inputs"), envs.pool.outputs.copy()
     envs.reset(options={"reset_mask": np.array([True, False, True])})
     assert envs.call("inputs")[1] == before[1] != envs.call("inputs")[0]
-    assert (envs.inside.pool.outputs == outputs).all(axis=0).tolist() == [False, True, False]
+    assert (envs.pool.outputs == outputs).all(axis=0).tolist() == [False, True, False]
 
 
 def test_histories_hold_what_was_before_the_episode(load):

@@ -205,7 +205,7 @@ class TestClosedLoop:
             start_values={"clock": env.variables["clock"]},
             validate=True,
         )
-        for index, variable in enumerate(env.inside.interface.inputs):
+        for index, variable in enumerate(env.interface.inputs):
             assert result[variable.name][1:] == pytest.approx([w[index] for w in wanted], abs=1e-5)
             assert result[variable.name][0] == result[variable.name][1]  # known at the beginning
 

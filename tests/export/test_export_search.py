@@ -91,7 +91,7 @@ def played(env, agent, step, steps=300, seed=1):
         The inputs of the plant that both want, shape (2, steps, m).
     """
     logic, policy = agent_of(env, agent).logic, agent.policy().bind(env)
-    written = [env.inside.interface.inputs.index(one) for one in logic.inputs]
+    written = [env.interface.inputs.index(one) for one in logic.inputs]
     observation, _ = env.reset(seed=seed)
     rows, is_over = [], False
     while not is_over and len(rows) < steps:
@@ -220,7 +220,7 @@ class Agents:
         controller.begin()
         policy, rows = agent.policy().bind(env), np.random.default_rng(0).normal(size=(200, 4))
         chosen = [policy.act(row) for row in rows.astype(np.float32)]
-        seen = rows[:, [env.inside.interface.outputs.index(v) for v in made.logic.measurements]]
+        seen = rows[:, [env.interface.outputs.index(v) for v in made.logic.measurements]]
         assert 5 < np.sum(chosen) < 195
         assert [controller.step(row) for row in seen] == [[-10.0 + 20.0 * one] for one in chosen]
         env.close()

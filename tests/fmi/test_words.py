@@ -131,9 +131,9 @@ def test_messages_of_earlier_episodes_explain_nothing(make_env, way):
     fault(env)
     env.reset()
     env.step(np.array([0.5], np.float32))
-    env.inside.pool.inputs[:] = np.nan
-    env.inside.pool.step_own()
-    assert "stuck" not in env.inside.pool.failure(0)
+    env.pool.inputs[:] = np.nan
+    env.pool.step_own()
+    assert "stuck" not in env.pool.failure(0)
 
 
 def test_environments_of_a_vector_say_their_own(tmp_path):

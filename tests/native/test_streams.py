@@ -13,7 +13,7 @@ from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
 from fmugym.pool.form import form_of_draws
 from fmugym.task import native_draws as module
-from fmugym.task.episode import EpisodeDraws
+from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.saving import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.streams import EpisodeStreams
@@ -58,7 +58,7 @@ class Own:
 
 
 def draws_of(*distributions):
-    return EpisodeDraws((), {}, {f"v{i}": value for i, value in enumerate(distributions)})
+    return EpisodeStart((), {}, {f"v{i}": value for i, value in enumerate(distributions)})
 
 
 @pytest.fixture(params=[True, False], ids=lambda native: "native" if native else "python")
@@ -195,7 +195,7 @@ def test_normals_are_left_to_python_where_numpys_function_is_not_found(monkeypat
 )
 def test_what_may_not_fit_is_checked_draw_by_draw(distribution, variable):
     env = Drawing()
-    draws = EpisodeDraws((env.fmu.variable(variable),), {variable: distribution}, {})
+    draws = EpisodeStart((env.fmu.variable(variable),), {variable: distribution}, {})
     assert draws.recipes is None
     env.close()
 

@@ -141,7 +141,7 @@ def test_after_a_fault_it_is_played_again(copying, caplog):
     with copying(isolation="process", on_fault="truncate") as env:
         snapshot = begin(env).save_state()
         expected = play(env)
-        pool = env.inside.pool
+        pool = env.pool
         os.kill(pool.processes()[0], signal.SIGKILL)
         with pytest.raises((SimulationError, AssertionError)):
             assert not env.step(ACTIONS[0])[3]

@@ -566,11 +566,11 @@ class TestTools:
         env.reset(seed=1)
         env.step(env.action_space.sample())
         assert env.fmu.description.interface == "model_exchange"
-        assert (env.inside.spec.solver, env.inside.spec.max_step) == ("rk4", 0.001)
+        assert (env.pool_spec.solver, env.pool_spec.max_step) == ("rk4", 0.001)
         env.close()
 
     def test_fixed_steps_are_by_default_those_of_the_fmu(self, fmu_path):
         for solver, max_step in (("euler", 0.01), ("dormand_prince", None)):
             env = BallEnv(fmu_path("ball"), solver=solver)
-            assert env.inside.spec.max_step == max_step
+            assert env.pool_spec.max_step == max_step
             env.close()

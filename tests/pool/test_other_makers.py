@@ -119,7 +119,7 @@ def test_what_is_invalid_in_it_does_not_stop(make_fmu):
 def test_who_calls_python_is_stepped_by_one_thread(make_fmu, name, make_envs, monkeypatch):
     """Two would hand the lock of Python over and over, and take eight times as long."""
     make = functools.partial(MadeEnv, make_fmu(name), name)
-    found = [make_envs(make, 4, **wishes).inside.pool.threads for wishes in ({}, {"threads": 2})]
+    found = [make_envs(make, 4, **wishes).pool.threads for wishes in ({}, {"threads": 2})]
     pool = opening.ProcessPool
 
     def isolated(*arguments, threads, **options):

@@ -65,7 +65,7 @@ def folder_in(temp_root):
 
 
 def is_isolated(env):
-    return hasattr(env.inside.pool, "processes")
+    return hasattr(env.pool, "processes")
 
 
 @posix_only
@@ -82,7 +82,7 @@ def test_resets_go_on(path, opened, temp_root, places, method, isolation):
         assert env.step(0)[0] == [42.5]
         remove(folder, places)
     if is_isolated(env):
-        os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+        os.kill(env.pool.processes()[0], signal.SIGKILL)
         assert env.step(0)[3]
         assert env.reset()[0] == [42.5]
     env.close()

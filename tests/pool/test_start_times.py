@@ -340,7 +340,7 @@ def first_days(env, episodes):
         observation, info = env.reset(seed=0 if episode == 0 else None)
         require_day(observation, env.time / DAY)
         if "start_time" in info["drawn"]:
-            assert env.time == info["drawn"]["start_time"] + env.inside.warm_up_steps * DAY / 4
+            assert env.time == info["drawn"]["start_time"] + env.warm_up_steps * DAY / 4
         days.add(round(env.time / DAY, 6))
     env.close()
     return days

@@ -148,7 +148,7 @@ class TestSingle:
         for env in (compiled, plain):
             played(env, 1, 60)
             env.step(np.array([0.01, 0.5], np.float32))
-        assert compiled.unwrapped.inside.compiled_step is not None
+        assert compiled.unwrapped.is_compiled
         assert np.array_equal(compiled.series.values, plain.series.values)
 
     def test_a_class_without_a_task_file(self, opened):

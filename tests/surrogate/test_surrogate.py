@@ -142,11 +142,11 @@ def test_courses_are_what_the_fmu_does():
     with closing(made[0]) as envs, closing(made[1]) as own:
         for one in (envs, own):
             one.reset(seed=5)
-        expected = [own.inside.pool.outputs.copy()]
+        expected = [own.pool.outputs.copy()]
         torques = np.random.default_rng(0).uniform(-2, 2, (7, 3, 1)).astype(np.float32)
         for action in torques:
             assert np.array_equal(envs.step(action)[0], own.step(action)[0])
-            expected.append(own.inside.pool.outputs.copy())
+            expected.append(own.pool.outputs.copy())
     assert courses.steps == 21
     for place, course in enumerate(courses.all()):
         assert np.array_equal(course.outputs, np.array(expected)[:, :, place])
@@ -181,7 +181,7 @@ class TestPool:
     def test_environments_that_rest_stay_as_they_are(self, pendulum):
         with closing(FMUVectorEnv(PendulumEnv, 3, backend=pendulum)) as envs:
             before, _ = envs.reset(seed=0)
-            pool = envs.inside.pool
+            pool = envs.pool
             kept = pool.outputs[:, 1].copy()
             envs.step_around(np.ones((3, 1), np.float32), np.array([False, True, False]))
             assert np.array_equal(pool.outputs[:, 1], kept)
@@ -193,7 +193,7 @@ class TestPool:
             envs.reset(seed=0)
             variable = Variable("m", "Real", 0, "parameter", "fixed", "exact")
             with pytest.raises(SimulationError, match="'m'"):
-                envs.inside.pool.read((variable,))
+                envs.pool.read((variable,))
 
     def test_lags_begin_anew_with_each_episode(self):
         """Of a house, which has a threshold and a hidden state."""
@@ -258,10 +258,10 @@ class TestStates:
         ):
             envs.reset(seed=1)
             others.reset(seed=2)
-            kept = envs.inside.pool.outputs.copy()
+            kept = envs.pool.outputs.copy()
             with pytest.raises(SimulationError, match="of another surrogate"):
                 envs.restore_state(others.save_state())
-            assert np.array_equal(envs.inside.pool.outputs, kept)
+            assert np.array_equal(envs.pool.outputs, kept)
 
     def test_what_was_not_set_in_its_courses_cannot_be_set(self, pendulum):
         with closing(FMUVectorEnv(PendulumEnv, 1, backend=pendulum)) as envs:
@@ -281,7 +281,7 @@ class TestPrediction:
         for backend in (courses, found):
             with closing(FMUVectorEnv(PendulumEnv, 2, backend=backend)) as envs:
                 envs.reset(seed=5)
-                pool = envs.inside.pool
+                pool = envs.pool
                 rows = [pool.outputs.copy()]
                 for action in actions:
                     envs.step(action)

@@ -29,8 +29,8 @@ def test_its_outputs_are_those_of_the_surrogate(make_env, version, tmp_path):
     """Lags, thresholds and products are in that of the house."""
     found = surrogate_of(make_env, held=4, steps=100)
     with closing(FMUVectorEnv(make_env, 1, backend=found)) as envs:
-        units = envs.inside.prototype.fmu.description.units
-        pool, spec = envs.inside.pool, envs.inside.prototype.inside.spec
+        units = envs.prototype.fmu.description.units
+        pool, spec = envs.pool, envs.prototype.pool_spec
         envs.reset(seed=3)
         names = [one.name for one in found.variables]
         can_be_set = [not is_start_time(one) for one in found.variables]

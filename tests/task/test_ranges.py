@@ -181,7 +181,7 @@ class TestTruncated:
     @pytest.mark.parametrize("kind", UNBOUNDED)
     def test_distributed_as_in_scipy(self, kind, make):
         env, rng = make({"c": (0, 0.9)}, c=UNBOUNDED[kind]), np.random.default_rng(1)
-        values = [env.inside.draws.draw_values(rng)[0] for _ in range(2000)]
+        values = [env.episode_start.draw_values(rng)[0] for _ in range(2000)]
         whole = stats.expon(-0.2, 0.5) if kind == "one-sided" else stats.norm(0.5, 0.4)
         below, within = whole.cdf(0), whole.cdf(0.9) - whole.cdf(0)
         assert stats.kstest(values, lambda x: (whole.cdf(x) - below) / within).pvalue > 0.01

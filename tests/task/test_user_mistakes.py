@@ -32,8 +32,8 @@ from fmugym.archive import ArchiveLimits
 from fmugym.baselines import PID
 from fmugym.config import EnvConfig
 from fmugym.errors import ArgumentError
+from fmugym.task.episode import READABLE
 from fmugym.task.plain import plain_attributes
-from fmugym.task.readings import READINGS
 
 
 @pytest.mark.parametrize("group", mistakes.GROUPS)
@@ -441,7 +441,7 @@ class TestHooks:
         with pytest.raises(ConfigError, match="unknown output 'summ'; did you mean 'sum'"):
             env.out["summ"]
 
-    @pytest.mark.parametrize("name", READINGS)
+    @pytest.mark.parametrize("name", READABLE)
     def test_attributes_in_the_place_of_what_they_read(self, make_env, name):
         def early(self, *args, **keywords):
             setattr(self, name, 1.0)

@@ -94,7 +94,7 @@ def differences(env, act, logic, step, steps, plant=None):
     """
     outer, env = env, env.unwrapped
     measured, written = ([v.name for v in part] for part in (logic.measurements, logic.inputs))
-    interface, worst = env.inside.interface, np.zeros(2)
+    interface, worst = env.interface, np.zeros(2)
     observation = env._get_observation()
     for count in range(steps):
         seen = [env.out[name] for name in measured]
@@ -254,7 +254,7 @@ def plant_of(env, tmp_path):
 
     def step(time):
         parts = env.config.substeps
-        size = env.inside.interface.time_step / parts
+        size = env.interface.time_step / parts
         for index in range(parts):
             slave.doStep(time + index * size, size)
 

@@ -39,7 +39,7 @@ def house_log(values, seed, days=14, noise=NOISE):
     wanted = np.repeat(rng.uniform(18.0, 23.0, 4 * days), DAY // 4)
     rows = []
     with closing(fmugym.load(task, physical=True)) as env:
-        names = [variable.name for variable in env.inside.spec.inputs]
+        names = [variable.name for variable in env.pool_spec.inputs]
         env.reset(seed=0)
         rows.append(measured(env))
         for setpoint in wanted:

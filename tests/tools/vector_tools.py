@@ -168,7 +168,7 @@ def require_same_alone(make, steps, mode="next_step", method=None, way=None, **o
     """
     mode = AutoresetMode[mode.upper()]
     ours = FMUVectorEnv(in_way(way, make), 3, autoreset_mode=mode, **options)
-    assert way in (None, ours.inside.engine.way)
+    assert way in (None, ours.engine.way)
     theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
     return run_side_by_side(ours, theirs, steps, method)
 

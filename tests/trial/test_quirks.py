@@ -163,8 +163,8 @@ def test_verdict(make_fmu, version, quirk, caplog):
     """What several instances need, and what the log tells."""
     path = make_fmu(quirk.token, version)
     envs = make_vector(path, quirk)
-    inside = envs.get_attr("inside")[0]
-    spec, starts = inside.spec, inside.draws.starts()
+    env = envs.prototype
+    spec, starts = env.pool_spec, env.episode_start.starts()
     envs.close()
     fmu = fmugym.FMU(path, probe_timeout=quirk.probe_timeout)
     verdict = examine(
@@ -345,9 +345,9 @@ class TestPromiseAboutStates:
         env = QuirkEnv(make_fmu("well behaved"), reset_method="reset")
         env.reset()
         assert self.returns(env) == 0.0
-        snapshot = env.inside.pool.save()
+        snapshot = env.pool.save()
         assert self.returns(env) == 1.0
-        env.inside.pool.restore(snapshot)
+        env.pool.restore(snapshot)
         env.close()
 
 

@@ -86,7 +86,7 @@ class TestDisturbing:
         path = make_fmu(token)
         options = {} if workers is None else {"workers": workers}
         with contextlib.closing(make_vector(path, isolation="process", **options)) as envs:
-            assert len(set(envs.inside.pool.processes())) == (workers or NUM_ENVS)
+            assert len(set(envs.pool.processes())) == (workers or NUM_ENVS)
             assert_all_right(envs, path)
 
     def test_the_log_and_info_say_why(self, make_fmu, token, caplog, ran):

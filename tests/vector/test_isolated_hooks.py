@@ -32,7 +32,7 @@ def fixture_make(opened):
         if workers:
             options |= {"isolation": "process", "workers": workers}
         envs = opened(FMUVectorEnv(in_way(hooks, cls), num_envs, **options))
-        assert isinstance(envs.inside.pool, ProcessPool) == bool(workers)
+        assert isinstance(envs.pool, ProcessPool) == bool(workers)
         return envs
 
     return make
@@ -107,7 +107,7 @@ def test_a_process_that_is_killed(make):
     for envs in (isolated, here):
         envs.reset(seed=2)
         envs.step(actions)
-    os.kill(isolated.inside.pool.processes()[0], signal.SIGKILL)
+    os.kill(isolated.pool.processes()[0], signal.SIGKILL)
     found, wanted = (envs.step(actions) for envs in (isolated, here))
     assert found[3].tolist() == [True, True, False, False]
     assert "SIGKILL" in found[4]["fault"][0]
@@ -175,19 +175,19 @@ def test_a_pool_without_a_library_steps_nothing(make):
     """Whatever is asked of the native pool that runs the programs, nothing crashes."""
     envs = make(Short, 3)
     envs.reset(seed=0)
-    around = programs_for(envs.inside.pool, envs.inside.pool._spec)
+    around = programs_for(envs.pool, envs.pool._spec)
     actions = np.zeros((3, 1), np.float32)
     for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around, name)(actions, *more)
-    before = envs.inside.pool.outputs.copy()
+    before = envs.pool.outputs.copy()
     assert around.step_own() == 3
     nothing = _native.Access(form_of_listing(()))
     assert around.reset(nothing, np.zeros((0, 3)), None, None) == 3
     code, answer = around.ask(Request.READ, request_listing((), 2))
     assert code == Answer.FAILURE
     assert answer[:8] == bytes(8)
-    np.testing.assert_array_equal(envs.inside.pool.outputs, before)
+    np.testing.assert_array_equal(envs.pool.outputs, before)
     around.close()
     with pytest.raises(SimulationError, match="closed"):
         around.step_own()

@@ -106,7 +106,7 @@ def test_a_hang_ends_after_the_time_limit_of_a_call(make, tmp_path):
     path = faulty_fmu(tmp_path)
     envs, found = with_faults(make, path, ("none", "hang", "none"), (0, 2, 0), call_timeout=0.5)
     assert found.lengths.tolist() == [6, 2, 6]
-    assert envs.inside.pool.health()["deaths"][1] > 0
+    assert envs.pool.health()["deaths"][1] > 0
 
 
 def test_a_rollout_may_take_longer_than_a_call(make, tmp_path):
@@ -115,4 +115,4 @@ def test_a_rollout_may_take_longer_than_a_call(make, tmp_path):
     pauses = ("pause",) * 3
     envs, found = with_faults(make, path, pauses, (1, 2, 3), call_timeout=0.35, workers=1)
     assert found.lengths.tolist() == [6, 6, 6]
-    assert envs.inside.pool.health()["deaths"].tolist() == [0, 0, 0]
+    assert envs.pool.health()["deaths"].tolist() == [0, 0, 0]

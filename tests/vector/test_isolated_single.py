@@ -16,6 +16,7 @@ from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from ways import in_python
 
 import fmugym
+from fmugym.errors import SimulationError
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.vector.making import make_with_pool
 
@@ -23,7 +24,7 @@ from fmugym.vector.making import make_with_pool
 def isolated(make_env):
     """A new environment with a worker process."""
     env = make_with_pool(make_env, isolation="process")
-    assert isinstance(env.inside.pool, ProcessPool)
+    assert isinstance(env.pool, ProcessPool)
     return env
 
 
@@ -64,7 +65,7 @@ def test_a_process_that_is_killed(cart):
     other = in_python(fmugym.envs.CartPoleEnv())
     other.reset(seed=0)
     before = other.step(0)
-    os.kill(cart.inside.pool.processes()[0], signal.SIGKILL)
+    os.kill(cart.pool.processes()[0], signal.SIGKILL)
     observation, _, terminated, truncated, info = cart.step(1)
     assert (terminated, truncated) == (False, True)
     assert "SIGKILL" in info["fault"]
@@ -78,7 +79,7 @@ def test_a_process_that_is_killed(cart):
 @linux_only
 def test_a_worker_that_sleeps_is_woken(cart):
     """It watches for the next message for 40 us only."""
-    (pid,) = cart.inside.pool.processes()
+    (pid,) = cart.pool.processes()
 
     def sleeps():
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
@@ -99,13 +100,14 @@ def test_interrupts_in_a_step_end_the_episode(cart):
 
     usual = signal.signal(signal.SIGALRM, ring)
     try:
-        os.kill(env.inside.pool.processes()[0], signal.SIGSTOP)
+        os.kill(env.pool.processes()[0], signal.SIGSTOP)
         signal.setitimer(signal.ITIMER_REAL, 0.2)
         with pytest.raises(KeyboardInterrupt):
             env.step(1)
     finally:
         signal.signal(signal.SIGALRM, usual)
     assert (env.step_count, env.action, env.previous_action) == (1, 1, 0)
-    assert env.inside.ended
+    with pytest.raises(SimulationError, match="after the end of the episode"):
+        env.step(1)
     env.reset(seed=0)
     assert env.step(1)[1] == 1.0

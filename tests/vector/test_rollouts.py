@@ -91,7 +91,7 @@ class TestValues:
     def test_from_the_present_episodes_which_go_on_afterwards(self, way, vector_of):
         envs = vector_of(Track, N, **way)
         envs.reset(seed=0)
-        actions = actions_for(envs.inside.prototype)
+        actions = actions_for(envs.prototype)
         envs.step(actions[:, 0])
         before = envs.save_state()
         found = envs.rollout(None, actions)
@@ -160,7 +160,7 @@ def test_from_one_root_no_state_is_serialized(monkeypatch, vector_of):
     """Planning costs one saved state, however many candidates there are."""
     env, envs = halfway(), vector_of(Track, N)
     snapshot, saved = env.save_state(), []
-    pool = envs.inside.pool
+    pool = envs.pool
     kept = pool.save_states
     monkeypatch.setattr(pool, "save_states", lambda i, r: saved.append(len(i)) or kept(i, r))
     envs.rollout(snapshot, actions_for(env, 3 * N))

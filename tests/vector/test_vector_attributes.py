@@ -207,6 +207,6 @@ def test_methods_that_no_environment_can_do_alone(hooks, make_envs):
 @each_way
 def test_what_the_environments_keep_themselves_cannot_be_set(hooks, make_envs):
     vector = make_envs(in_way(hooks, CART_POLE), 2)
-    for name in ("state", "time", "action_space", "inside", "step", "_is_done", "fmu"):
+    for name in ("state", "time", "action_space", "interface", "step", "_is_done", "fmu"):
         with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
             vector.set_attr(name, 1.0)

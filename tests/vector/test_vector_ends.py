@@ -292,15 +292,15 @@ class Failing:
 def with_failing(task, monkeypatch):
     """Environments, and what lets their calls fail."""
     envs, made_of = made(task), []
-    prepare = envs.inside.pool.prepare_play
+    prepare = envs.pool.prepare_play
 
     def prepared(*parts):
         play = prepare(*parts)
         made_of.append(Failing(play.start_and_step))
         return play._replace(start_and_step=made_of[-1])
 
-    monkeypatch.setattr(envs.inside.pool, "prepare_play", prepared)
-    envs.inside.engine._prepare(envs.inside.engine._task)
+    monkeypatch.setattr(envs.pool, "prepare_play", prepared)
+    envs.engine._prepare(envs.engine._task)
     envs.reset(seed=0)
     return envs, made_of[-1]
 

@@ -245,11 +245,11 @@ def test_a_first_observation_that_is_not_finite_in_the_step_that_ends_another_ep
 
 def test_references_do_not_leak(made):
     envs, mask = made(CART_POLE), np.array([True, False, False, True, False])
-    engine, options = envs.inside.engine, {"reset_mask": mask}
+    engine, options = envs.engine, {"reset_mask": mask}
     watched = (
         mask,
         options,
-        engine.env.inside.draws,
+        engine.env.episode_start,
         CART_POLE,
         None,
         True,

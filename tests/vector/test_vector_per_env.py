@@ -113,12 +113,12 @@ def test_a_step_that_one_environment_refuses_changes_none(make_envs):
     envs.step(good)
     names = ("action", "previous_action", "state", "previous_state", "inputs", "step_count")
     before = [envs.get_attr(name) for name in names]
-    given = envs.inside.pool.inputs.copy()
+    given = envs.pool.inputs.copy()
     with pytest.raises(ConfigError, match="environment 2"):
         envs.step(np.float32([[0.004], [0.005], [0.01]]))
     for name, values in zip(names, before, strict=True):
         np.testing.assert_array_equal(envs.get_attr(name), values, err_msg=name)
-    np.testing.assert_array_equal(envs.inside.pool.inputs, given)
+    np.testing.assert_array_equal(envs.pool.inputs, given)
 
 
 class Breaking(Drawing):
@@ -186,7 +186,7 @@ def test_inputs_are_asked_of_a_hook_that_was_set_later(make_envs):
     envs.call("replace")
     envs.step(actions)
     assert envs.get_attr("inputs") == ((0.5 * plain,), (0.5 * plain,))
-    np.testing.assert_array_equal(envs.inside.pool.inputs, [[0.5 * plain] * 2])
+    np.testing.assert_array_equal(envs.pool.inputs, [[0.5 * plain] * 2])
 
 
 class Informing(Drawing):
@@ -204,8 +204,8 @@ def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments(make_
     envs.reset(seed=0)
     actions = np.zeros((2, 1), np.float32)
     envs.step(actions)
-    envs.inside.engine.ended[:] = [False, True]
-    envs.inside.engine.any_ended = True
+    envs.engine.ended[:] = [False, True]
+    envs.engine.any_ended = True
     infos = envs.step(actions)[-1]
     assert infos["part"].tolist() == [1.0, 0.0]
     assert infos["part"].dtype == np.float64

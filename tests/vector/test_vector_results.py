@@ -207,12 +207,12 @@ def test_results_that_are_incomplete_are_refused(monkeypatch):
 
 def require_refused(results, monkeypatch, *, refused=True):
     envs = make(CART_POLE)
-    prepare = envs.inside.pool.prepare_play
+    prepare = envs.pool.prepare_play
 
     def with_others(*parts):
         return prepare(*parts[:-1], parts[-1] | {"results": results})
 
-    monkeypatch.setattr(envs.inside.pool, "prepare_play", with_others)
+    monkeypatch.setattr(envs.pool, "prepare_play", with_others)
     with pytest.raises((TypeError, ValueError)) if refused else contextlib.nullcontext():
-        envs.inside.engine._prepare(envs.inside.engine._task)
+        envs.engine._prepare(envs.engine._task)
     envs.close()

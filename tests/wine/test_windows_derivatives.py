@@ -90,7 +90,7 @@ class TestInWine:
         envs.reset(seed=0)
         for _ in range(3):
             envs.step(TORQUES[:3])
-        pool, fmu = envs.inside.pool, envs.inside.prototype.fmu
+        pool, fmu = envs.pool, envs.prototype.fmu
         slope = fmu.description.state_derivatives["theta_dot"]
         unknowns, knowns = (fmu.variable(slope),), (fmu.variable("theta"), fmu.variable("tau"))
         found = pool.differentiate(unknowns, knowns)

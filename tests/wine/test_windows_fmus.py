@@ -332,7 +332,7 @@ class TestInWine:
         monkeypatch.setenv("FMUGYM_PROBE", "on")
         with caplog.at_level(logging.INFO, "fmugym"):
             env = opened(fmugym.FMUVectorEnv(lambda: ForcedCartPole(cart_pole), 2))
-        assert isinstance(env.inside.pool, ProcessPool)
+        assert isinstance(env.pool, ProcessPool)
         (line,) = (r.getMessage() for r in caplog.records if "was tried with 2" in r.getMessage())
         assert " 0 initialization" not in line
 

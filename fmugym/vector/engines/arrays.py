@@ -12,8 +12,8 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray, Played
+from fmugym.task.episode import environments_last
 from fmugym.task.hooks import Hooks
-from fmugym.task.readings import environments_last
 from fmugym.task.step import ORDER, conclude
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.engine import StepResult, failed_in
@@ -40,7 +40,10 @@ class ArrayEngine(BatchEngine):
         self._busy: MaskArray | None = None
         self._all = np.ones(num_envs, np.bool_)
         super().__init__(
-            env, num_envs, max_episode_steps, TaskPrograms.without_programs(env.variables)
+            env,
+            num_envs,
+            max_episode_steps,
+            TaskPrograms.without_programs(env.variables, len(env.interface.inputs)),
         )
 
     def _prepare(self, task: TaskPrograms) -> None:
@@ -59,7 +62,7 @@ class ArrayEngine(BatchEngine):
     ) -> tuple[Any, dict[str, Any]]:
         """See ``BatchEngine._begun``."""
         self.has_moved = True
-        made = observations if self.env.inside.pool_observes else None
+        made = observations if self.env._conversions.pool_observes else None
         observations, more = self._seen_at_start(made, infos["_drawn"])
         return observations, more | infos
 
@@ -87,23 +90,21 @@ class ArrayEngine(BatchEngine):
         If the hook fails, nothing has changed.
         """
         taken = np.array(super()._take_actions(actions, idle))  # of which a hook may keep a part
-        read = self.env.inside.readings
-        before = read.action, read.previous_action, read.previous_state
-        read.previous_action, read.action = read.action, environments_last(taken)
-        read.previous_state = read.state
+        read = self.env._episode
+        before, read.action = read.keep(), environments_last(taken)
         try:
-            self._write_inputs(self._pool.inputs, idle)
+            self._write_inputs(self._memory.given, idle)
             self._keep_variables()
             return taken
         except Exception as error:
             self._blame_arrays(error)
             raise
         finally:
-            read.action, read.previous_action, read.previous_state = before
+            read.take_back(before)  # the pool does the same with its arrays
 
     def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
         """See ``BatchEngine._completed``; the hooks that follow the FMUs' step are called."""
-        env, inside = self.env, self.env.inside
+        env, conversions = self.env, self.env._conversions
         result, troubled, _, started = played
         started = idle if started is None else started
         self._idle = started
@@ -111,7 +112,7 @@ class ArrayEngine(BatchEngine):
             failed = failed_in(self._pool.statuses)
             self._idle = failed if started is None else failed | started
         self._busy = None if self._idle is None else ~self._idle
-        observed = result.observations if inside.pool_observes else None
+        observed = result.observations if conversions.pool_observes else None
         try:
             stopped = result.terminated if troubled else False
             seen, rewards, terminated, truncated = conclude(
@@ -120,7 +121,7 @@ class ArrayEngine(BatchEngine):
             if observed is None:
                 seen = hook_results.observations(seen, env.observation_space, self._n)
             infos = result.infos
-            if inside.has_info:
+            if conversions.has_info:
                 infos = self._infos(self._all) | infos
             self._keep_variables()
             self._are_hooks_tried = True
@@ -216,7 +217,7 @@ class ArrayEngine(BatchEngine):
         array = hook_results.variable(name, value, self._n)
         if array.dtype == np.float64:
             return array
-        dtype = hook_results.type_of_variable(self.env.inside.draws, name, array.dtype)
+        dtype = hook_results.type_of_variable(self.env.episode_start, name, array.dtype)
         return array.astype(dtype, copy=False)
 
     def _holds(self, value: npt.NDArray[Any]) -> bool:

@@ -28,11 +28,11 @@ from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.beginning import Beginning
 from fmugym.task.construction import draws_of, draws_of_reset
-from fmugym.task.episode import Episode, EpisodeDraws
-from fmugym.task.future import assumed
+from fmugym.task.episode import Episode, standing_in
+from fmugym.task.episode_start import EpisodeStart, EpisodeValues
+from fmugym.task.future import assumed, future_of
 from fmugym.task.native_draws import no_draws
 from fmugym.task.plain import put_back
-from fmugym.task.readings import Readings, reading
 from fmugym.task.saving import note_attributes
 from fmugym.task.snapshot import Columns
 from fmugym.task.values import ParameterValues, ShownParameters
@@ -54,7 +54,7 @@ from fmugym.vector.vector_saving import (
     require_fit,
     which_of,
 )
-from fmugym.vector.views import ColumnReadings, batched, some, take
+from fmugym.vector.views import EpisodeColumn, batched, keep_rows, some, start_numbers, take
 
 __all__ = ["BatchEngine"]
 
@@ -83,22 +83,22 @@ class BatchEngine(Engine):
         super().__init__(num_envs)
         self.env = env
         self._n = num_envs
-        self._pool = env.inside.pool
+        self._pool = env._instance.pool
         self._streams = EpisodeStreams(num_envs)
-        self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
+        self._limit = min(env.step_limit, max_episode_steps or sys.maxsize)
         self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
         self._variable_starts: dict[str, FloatArray] = {}
-        env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
-        env.inside.was_reset = True  # for the calls on single environments
+        env._episode = batched(env, num_envs, self._pool)
+        env._was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
         self._strings = env.fmu.description.strings
-        self._make_parameters(env.inside.draws)
-        self._memory = Memory(env, env.inside.readings, self.ended)
+        self._make_parameters(env.episode_start)
+        self._memory = Memory(env, env._episode, self.ended)
         self._prepare(task)
         self._note_foreign(slice(None), False)
 
-    def _make_parameters(self, draws: EpisodeDraws) -> None:
+    def _make_parameters(self, draws: EpisodeStart) -> None:
         self._start_values = np.repeat(draws.constants[:, None], self._n, axis=1)
         self._parameters = ParameterValues(
             zip(draws.parameter_names, self._start_values, strict=True)
@@ -114,7 +114,7 @@ class BatchEngine(Engine):
     def _prepare(self, task: TaskPrograms) -> None:
         """Give the pool everything it needs for steps."""
         env, memory = self.env, self._memory
-        draws, native = env.inside.draws, env.inside.draws.native
+        draws, native = env.episode_start, env.episode_start.native
         drawn = () if native is None else draws.drawn
         self._task = task
         memory.parameters = self._parameters
@@ -131,7 +131,7 @@ class BatchEngine(Engine):
         starts, rows = env.config.episode_variables, memory.variables
         fit = all(np.shape(start) == rows[n].shape[:-1] for n, start in starts.items())
         has_all_starts = native is not None and fit
-        is_free = env.inside.warm_ups is None and not self._pool.retries_resets
+        is_free = env._warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
         self._settle_starts()
 
@@ -154,11 +154,11 @@ class BatchEngine(Engine):
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         env, before = self.env, self.env.parameters
-        env.inside.interface = env.inside.interface.with_parameter(name, values, 0)
-        variable = env.inside.interface.parameter_variables[name]
+        env.interface = env.interface.with_parameter(name, values, 0)
+        variable = env.interface.parameter_variables[name]
         self._given[name] = np.array([checked_value(variable, one) for one in values.tolist()])
-        env.inside.draws = draws_of(env)
-        self._make_parameters(env.inside.draws)
+        env.episode_start = draws_of(env)
+        self._make_parameters(env.episode_start)
         for known in before.keys() & self._parameters.keys():
             self._place_parameter(known, before[known], slice(None))
         self._prepare(self._task)
@@ -177,14 +177,14 @@ class BatchEngine(Engine):
         """See ``Engine.single``; the prototype stands in for the environment."""
         env = self.env
         own = {name: take(row, index) for name, row in self._columns.items()}
-        with reading(env, ColumnReadings(env.inside.readings, index)):
+        with standing_in(env, EpisodeColumn(env._episode, index)):
             try:
                 _set_all(env, own)
-                env.inside.pool = PoolColumn(self._pool, index)
+                env._instance.pool = PoolColumn(self._pool, index)
                 yield env
             finally:
                 _set_all(env, self._columns)
-                env.inside.pool = self._pool
+                env._instance.pool = self._pool
 
     def read(self, name: str, index: int) -> Any:
         """See ``Engine.read``; a method that is called later reads the values of that moment."""
@@ -247,8 +247,8 @@ class BatchEngine(Engine):
     ) -> FloatArray:
         """See ``Engine.evaluate``."""
         env = self.env
-        latest = env.inside.readings.replaced(action=np.moveaxis(np.asarray(actions), 0, -1))
-        with reading(env, some(latest, indices)):
+        latest = env._episode.replaced(action=np.moveaxis(np.asarray(actions), 0, -1))
+        with standing_in(env, some(latest, indices)):
             rows = function(env)
         return np.array([np.broadcast_to(row, len(indices)) for row in rows], np.float64)
 
@@ -326,7 +326,7 @@ class BatchEngine(Engine):
                 f"environment {index}: the first observation is not finite: {first}"
             )
 
-    def _begin(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
+    def _begin(self, indices: IndexArray, draws: EpisodeStart, drawn: FloatArray) -> None:
         """Start episodes with values that were drawn, shape (draws, M)."""
         self._place_episodes(indices, draws, drawn)
         self.has_moved = True
@@ -335,9 +335,9 @@ class BatchEngine(Engine):
             rows[name] = np.zeros(self._n)
             rows[name][indices] = numbers
         values = np.array([*rows.values()]).reshape(len(rows), self._n)
-        _Beginning(self, draws, Episode(values, rows, {}, {}), indices).begin()
+        _Beginning(self, draws, EpisodeValues(values, rows, {}, {}), indices).begin()
 
-    def _place_episodes(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
+    def _place_episodes(self, indices: IndexArray, draws: EpisodeStart, drawn: FloatArray) -> None:
         """Write the values of episodes into the rows of the parameters and variables."""
         constants = draws.constant_parameters
         self._place(draws.variable_starts | constants | draws.named(drawn), indices)
@@ -347,9 +347,9 @@ class BatchEngine(Engine):
         self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
         for name, numbers in self._numbers_of_told_texts(draws, drawn).items():
             self._place_parameter(name, texts_at(draws.strings[name], numbers), indices)
-        self._note_foreign(indices, draws is not self.env.inside.draws)
+        self._note_foreign(indices, draws is not self.env.episode_start)
 
-    def _numbers_of_told_texts(self, draws: EpisodeDraws, drawn: FloatArray) -> dict[str, Any]:
+    def _numbers_of_told_texts(self, draws: EpisodeStart, drawn: FloatArray) -> dict[str, Any]:
         """What options give to Strings: places among the texts that only these draws know."""
         told = draws.strings.keys() & draws.told.keys()
         numbers = draws.constant_parameters | draws.named(drawn) if told else {}
@@ -415,7 +415,7 @@ class BatchEngine(Engine):
 
     def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
         """Whether parameters that are placed are not all the usual ones."""
-        draws = self.env.inside.draws
+        draws = self.env.episode_start
         own = all(
             (np.asarray(columns[name]) == value).all()
             for name, value in draws.constants_shown.items()
@@ -430,7 +430,7 @@ class BatchEngine(Engine):
         """See ``Engine.assuming``."""
         own, self.offsets = self._task, offsets
         try:
-            with assumed([self.env.inside.future], tables) as others:
+            with assumed([future_of(self.env)], tables) as others:
                 if others:
                     self._prepare(own.with_tables(others))
                 yield
@@ -513,7 +513,7 @@ class BatchEngine(Engine):
     @passes_refusals
     def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
         """Start the episodes in the mask, and let the FMUs of the other environments step."""
-        play, draws = self._play, self.env.inside.draws
+        play, draws = self._play, self.env.episode_start
         self.has_moved = True
         if starting is None:
             play.before(actions)
@@ -550,7 +550,7 @@ class BatchEngine(Engine):
     def _settle(self, result: StepResult, troubled: int, started: MaskArray | None) -> None:
         """Find numbers that are not finite, and handle them and failures."""
         rewards = not_finite(result.rewards)
-        is_told = self.env.inside.pool_observes and not troubled
+        is_told = self.env._conversions.pool_observes and not troubled
         observations = None if is_told else not_finite(result.observations)
         if troubled or rewards is not None or observations is not None:
             self._mend(result, started, (rewards, observations))
@@ -570,10 +570,10 @@ class BatchEngine(Engine):
 
     def _write_inputs(self, inputs: FloatArray, resetting: MaskArray | None) -> None:
         hook_results.write_inputs(self.env._get_inputs(), inputs)
-        if not self.env.inside.input_writer.all_real:
+        if not self.env._conversions.input_writer.all_real:
             for index in self._stepping(resetting):
                 inputs[:, index] = fmu_spaces.to_input_types(
-                    self.env.inside.interface.inputs, inputs[:, index]
+                    self.env.interface.inputs, inputs[:, index]
                 )
         self._require_finite(inputs, resetting)
 
@@ -600,10 +600,10 @@ class BatchEngine(Engine):
         return hook_results.observations(env._get_observation(), env.observation_space, self._n)
 
     def _infos(self, mask: MaskArray) -> dict[str, Any]:
-        if not self.env.inside.has_info:
+        if not self.env._conversions.has_info:
             return {}
         infos = hook_results.info_arrays(self.env._get_info(), mask)
-        if self.env.inside.pool_tells:
+        if self.env._instance.tells:
             infos |= hook_results.info_arrays(self._pool.info(), mask)
         return infos
 
@@ -632,7 +632,7 @@ class BatchEngine(Engine):
     def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
         """Refuse inputs that are not finite, which they also are outside of their type's range."""
         inputs = self._pool.inputs
-        if not self.env.inside.input_writer.all_real and not np.isfinite(inputs).all():
+        if not self.env._conversions.input_writer.all_real and not np.isfinite(inputs).all():
             self._write_inputs(np.array(inputs), resetting)
         self._require_finite(inputs, resetting)
 
@@ -674,7 +674,7 @@ class BatchEngine(Engine):
         undone = faulty & ~failed
         if undone.any():
             self._undo(undone)
-        if undone.any() or env.inside.has_info or not env.inside.pool_observes:
+        if undone.any() or env._conversions.has_info or not env._conversions.pool_observes:
             self._see_again(result, faulty, reasons)
         texts = np.full(self._n, None, dtype=object)
         texts[faulty] = list(reasons.values())
@@ -687,7 +687,7 @@ class BatchEngine(Engine):
     def _undo(self, mask: MaskArray) -> None:
         """Return environments to the state before a step whose numbers are not finite."""
         self._pool.outputs[:, mask] = self._memory.kept[:, mask]
-        if self.env.inside.own.update:
+        if self.env._own_hooks.update:
             self._restore_variables(mask)
         for index in np.flatnonzero(mask).tolist():
             self._pool.note_fault(index)
@@ -702,7 +702,7 @@ class BatchEngine(Engine):
                 f"environment {index}: {reasons[index]}; before it the observation is {before}"
             )
         copy_rows(again, result.observations, mask)
-        if self.env.inside.has_info:
+        if self.env._conversions.has_info:
             infos = self._infos(np.ones(self._n, np.bool_))
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 
@@ -716,28 +716,26 @@ class _Beginning(Beginning):
     """
 
     def __init__(
-        self, engine: BatchEngine, draws: EpisodeDraws, episode: Episode, indices: IndexArray
+        self, engine: BatchEngine, draws: EpisodeStart, episode: EpisodeValues, indices: IndexArray
     ) -> None:
         super().__init__(engine.env, draws, episode, indices)
         self._engine = engine
 
     def clear(self, inputs: list[Any], action: Any) -> None:
         """See ``Beginning.clear``."""
-        read, own = self.env.inside.readings, self.indices
+        read, own = self.env._episode, self.indices
         for row, value in zip(read.inputs, inputs, strict=True):
             row[own] = value[own] if isinstance(value, np.ndarray) else value
-        for row in (read.action, read.previous_action):
-            row[..., own] = np.asarray(action)[..., np.newaxis]
-        read.step_count[own], read.done[own], read.after_end[own] = 0, False, False
+        read.action[..., own] = np.asarray(action)[..., np.newaxis]
+        start_numbers(read, own)
 
     def look(self) -> None:
         """See ``Beginning.look``."""
-        read = self.env.inside.readings
-        read.previous_state[:, self.indices] = read.state[:, self.indices]
+        keep_rows(self.env._episode, self.indices)
 
-    def readings(self, indices: IndexArray) -> Readings:
-        """See ``Beginning.readings``."""
-        return some(self.env.inside.readings, indices)
+    def episodes(self, indices: IndexArray) -> Episode:
+        """See ``Beginning.episodes``."""
+        return some(self.env._episode, indices)
 
     def row(self, name: str) -> FloatArray:
         """See ``Beginning.row``."""

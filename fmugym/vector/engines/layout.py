@@ -32,9 +32,9 @@ class Layout:
     def __init__(self, task: TaskPrograms, env: FMUEnv, count: int) -> None:
         self._paths = [array.path for array in task.seen]
         self.shapes = tuple(((count, *array.shape), array.dtype) for array in task.seen)
-        if not task.seen and env.inside.pool_observes:
+        if not task.seen and env._conversions.pool_observes:
             self._paths = [("observation",)]
-            self.shapes = (((count, env.inside.output_count), np.dtype(np.float32)),)
+            self.shapes = (((count, env.interface.output_count), np.dtype(np.float32)),)
         observations, infos = self._nested(range(len(self._paths)))
         self.form = _pairs(observations), _pairs(infos)
 

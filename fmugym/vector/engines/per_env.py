@@ -21,7 +21,7 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.actions import take_action
 from fmugym.task.construction import draws_of, draws_of_reset, prepare_hooks
-from fmugym.task.future import assumed
+from fmugym.task.future import assumed, future_of
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, note_attributes, place_columns
@@ -60,7 +60,7 @@ class PerEnvEngine(Engine):
         self._envs, self._pool = envs, pool
         self._columns = [PoolColumn(pool, index) for index in range(len(envs))]
         for env, column in zip(envs, self._columns, strict=True):
-            env.inside.use(column)
+            env._use(column)
             prepare_hooks(env)  # its constructor may have changed the spaces
         self._checks_all = is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
@@ -110,14 +110,15 @@ class PerEnvEngine(Engine):
     def set_variable(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_variable``."""
         for index, env in enumerate(self._envs):
-            env.variables[name] = env.inside.variable_starts[name] = take(values, index)
-            env.inside.draws = draws_of(env)
+            env.variables[name] = own = take(values, index)
+            env._variable_starts = {**env._variable_starts, name: own}
+            env.episode_start = draws_of(env)
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         for index, env in enumerate(self._envs):
-            env.inside.interface = env.inside.interface.with_parameter(name, values, index)
-            env.inside.draws = draws_of(env)
+            env.interface = env.interface.with_parameter(name, values, index)
+            env.episode_start = draws_of(env)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
@@ -152,7 +153,7 @@ class PerEnvEngine(Engine):
         except BaseException:
             for env in self._envs:
                 if self.has_moved:  # its FMU has stepped without a result
-                    env.inside.ended = True
+                    env._ended = True
             raise
         if resting is not None:
             result.truncated[resting] = False
@@ -174,7 +175,7 @@ class PerEnvEngine(Engine):
                     result = observation, 0.0, False, False, info
                 else:
                     result = _concluded(env, statuses[index], tuple(columns[index]))
-                is_new = env.inside.pool_observes
+                is_new = env._conversions.pool_observes
                 self._observations[index] = result[0] if is_new else _copied(result[0])
                 results.append(result)
         except FMUGymError as error:
@@ -184,7 +185,7 @@ class PerEnvEngine(Engine):
     def _result(self, results: Sequence[Result]) -> StepResult:
         _, rewards, terminated, cut_off, infos = zip(*results, strict=True)
         truncated = np.array(cut_off, np.bool_)
-        counts = [env.inside.readings.step_count for env in self._envs]
+        counts = [env._episode.step_count for env in self._envs]
         truncated |= np.array(counts) >= self._limit
         result = StepResult(
             self._joined(),
@@ -213,7 +214,7 @@ class PerEnvEngine(Engine):
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         env = self._envs[index]
-        is_first = not env.inside.was_reset
+        is_first = not env._was_reset
         try:
             self.has_moved = True  # what can be refused was checked before
             result = env.reset(seed=seed, options=dict(options))
@@ -233,7 +234,7 @@ class PerEnvEngine(Engine):
                 befores.append((env, take_action(env, actions[index])))
         except BaseException as error:
             for env, before in befores:
-                env.inside.readings.take_back(before)
+                env._episode.take_back(before)
             self._pool.inputs[...] = given
             if isinstance(error, FMUGymError):
                 raise _located(error, index) from error
@@ -273,7 +274,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.assuming``."""
         self.offsets = offsets
         try:
-            with assumed((env.inside.future for env in self._envs), tables):
+            with assumed(map(future_of, self._envs), tables):
                 yield
         finally:
             self.offsets = None
@@ -295,7 +296,7 @@ class PerEnvEngine(Engine):
 
 def _concluded(env: FMUEnv, status: int, values: tuple[float, ...]) -> Result:
     """The result of a step that its FMU has done."""
-    env.inside.readings.step_count += 1
+    env._episode.step_count += 1
     result = judged(env, status, values)
     if env.render_mode is not None:
         note_for_picture(env, result[1])
@@ -331,14 +332,14 @@ def _share_constants(first: FMUEnv, env: FMUEnv) -> None:
 
     The objects of a thousand environments do not fit into the processor's caches.
     """
-    env.inside.is_finite, env.inside.input_writer = (
-        first.inside.is_finite,
-        first.inside.input_writer,
+    env._conversions.is_finite, env._conversions.input_writer = (
+        first._conversions.is_finite,
+        first._conversions.input_writer,
     )
     env.out.share_names(first.out)
-    if env.inside.own == first.inside.own:
-        env.inside.own, env.inside.observe, env.inside.elements = (
-            first.inside.own,
-            first.inside.observe,
-            first.inside.elements,
+    if env._own_hooks == first._own_hooks:
+        env._own_hooks, env._conversions.observe, env._conversions.elements = (
+            first._own_hooks,
+            first._conversions.observe,
+            first._conversions.elements,
         )

@@ -20,17 +20,18 @@ from gymnasium import spaces
 from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError, shown
+from fmugym.expressions.quantities import KEPT
 from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
+from fmugym.task.episode import Episode, standing_in
 from fmugym.task.hooks import Hooks
 from fmugym.task.plain import changed, plain_attributes, put_back
-from fmugym.task.readings import Readings, reading
 from fmugym.task.results import as_flag, as_info, as_reward
 from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.vector.codec import mapped
 from fmugym.vector.hooks import hook_results
-from fmugym.vector.views import ColumnReadings, batched
+from fmugym.vector.views import EpisodeColumn, batched
 
 __all__ = ["CURE", "find_difference", "own_hooks"]
 
@@ -52,9 +53,7 @@ _MOST_BATCHES: Final = 24
 _FACTORS: Final = (-0.3, 10.0, 300.0, 1e5, -1e5)
 """Of outputs, beside limits: other magnitudes than those that episodes reach."""
 
-_READ_ONLY: Final = (
-    *("outputs", "previous_state", "inputs", "action", "previous_action", "step_count", "done"),
-)
+_READ_ONLY: Final = tuple(one.attribute for one in KEPT)
 
 _WRITING: Final = ("_get_inputs", "_update")
 """The hooks that may write episode variables."""
@@ -76,13 +75,13 @@ class _Row:
         kind: ``"step"``; ``"start"`` if an episode has just begun; ``"failed"`` if the FMU has not
             done the step, so that nothing counts that hooks return; ``"limit"``, where they may
             fail, too.
-        readings: What ``_is_done`` and the hooks after it read.
+        episode: What ``_is_done`` and the hooks after it read.
         before: The episode variables before ``_update``.
         done: What ``_is_done`` has returned.
     """
 
     kind: Kind
-    readings: Readings
+    episode: Episode
     before: dict[str, Any]
     done: bool
 
@@ -122,7 +121,7 @@ def own_hooks(env: FMUEnv) -> list[str]:
 
 def _is_own(env: FMUEnv, name: str) -> bool:
     """Whether a hook is neither a default nor an expression."""
-    if name == "_reward_policy" and env.inside.own.goal_reward:
+    if name == "_reward_policy" and env._own_hooks.goal_reward:
         return True
     return name not in vars(env) and getattr(type(env), name) is not getattr(Hooks, name)
 
@@ -132,7 +131,7 @@ def _is_own(env: FMUEnv, name: str) -> bool:
 
 def _rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
     """Play episodes with actions inside of their range and at its ends."""
-    if env.inside.pool.is_real:
+    if env._instance.pool.is_real:
         yield from _drawn_rows(env, rng)  # nothing real must move
         return
     rows: list[_Row] = []
@@ -170,11 +169,13 @@ def _at_end(space: Any, action: Any, at_ends: bool) -> Any:
 
 
 def _row_of(env: FMUEnv, kind: Kind, before: Mapping[str, Any]) -> _Row:
-    now = env.inside.readings.copy()
+    now = env._episode.copy()
     parameters = MappingProxyType(ParameterValues(now.parameters))
     variables = _variables(now.variables)
     kept = now.replaced(parameters=parameters, variables=variables)
-    kept.action, kept.previous_action = np.array(now.action), np.array(now.previous_action)
+    for one in KEPT:
+        if one.shape == "action":
+            setattr(kept, one.attribute, np.array(getattr(now, one.attribute)))
     return _Row(kind, kept, dict(before), bool(now.done))
 
 
@@ -186,8 +187,8 @@ def _variables(values: Mapping[str, Any]) -> EpisodeVariables:
 
 def _spread_variables(rows: Sequence[_Row]) -> None:
     """Give each variable the shape that it has in later steps everywhere."""
-    for name in rows[0].readings.variables:
-        held = [part for row in rows for part in (row.readings.variables, row.before)]
+    for name in rows[0].episode.variables:
+        held = [part for row in rows for part in (row.episode.variables, row.before)]
         shape = np.broadcast_shapes(*(np.shape(part[name]) for part in held))
         for part in held if shape else ():
             part[name] = np.array(np.broadcast_to(part[name], shape))
@@ -196,15 +197,17 @@ def _spread_variables(rows: Sequence[_Row]) -> None:
 def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
     """States around zero, of episodes that nobody has played."""
     for index in range(_STEPS // 4):
-        episode, now = env.inside.draws.draw(rng), env.inside.readings.copy()
-        values = tuple(rng.normal(size=len(now.outputs)).tolist())
+        episode, now = env.episode_start.draw(rng), env._episode.copy()
         variables = _variables(now.variables | episode.variables)
+        drawn = {
+            one.attribute: np.array(_sample_of(env.action_space, rng))
+            if one.shape == "action"
+            else tuple(rng.normal(size=len(getattr(now, one.attribute))).tolist())
+            for one in KEPT
+            if one.shape != "number"
+        }
         kept = now.replaced(
-            outputs=values,
-            previous_state=tuple(rng.normal(size=env.inside.output_count).tolist()),
-            inputs=tuple(rng.normal(size=len(now.inputs)).tolist()),
-            action=np.array(_sample_of(env.action_space, rng)),
-            previous_action=np.array(_sample_of(env.action_space, rng)),
+            **drawn,
             step_count=index,
             parameters=MappingProxyType(ParameterValues(episode.parameters)),
             variables=variables,
@@ -214,15 +217,15 @@ def _drawn_rows(env: FMUEnv, rng: np.random.Generator) -> Iterator[_Row]:
 
 def _at_limits(env: FMUEnv, rows: Sequence[_Row], rng: np.random.Generator) -> Iterator[_Row]:
     """Rows whose outputs are at the ends of their ranges, or of another magnitude."""
-    variables = env.inside.interface.outputs + env.inside.interface.monitors
+    variables = env.interface.outputs + env.interface.monitors
     lows, highs = (np.array(one, np.float64) for one in zip(*map(_ends_of, variables), strict=True))
     for row in rows[:: 1 + len(rows) // _ROWS_AT_LIMITS]:
-        values = np.array(row.readings.outputs)
+        values = np.array(row.episode.outputs)
         places = [np.where(np.isfinite(ends), ends, values) for ends in (lows, highs)]
         places += [values * factor * rng.uniform(0.5, 1.5, len(values)) for factor in _FACTORS]
         for place in places:
-            before = place[: env.inside.output_count] * rng.uniform(0.9, 1.0)
-            moved = row.readings.replaced(
+            before = place[: env.interface.output_count] * rng.uniform(0.9, 1.0)
+            moved = row.episode.replaced(
                 outputs=tuple(place.tolist()), previous_state=tuple(before.tolist())
             )
             yield _Row("limit", moved, row.before, bool(rng.integers(2)))
@@ -247,9 +250,8 @@ def _sample_of(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
 def _counts(env: FMUEnv) -> tuple[int, ...]:
     """Numbers of environments: one that no length of the task equals, one that does, and 1."""
     arrays = spaces.flatten_space(env.observation_space).shape or (1,)
-    inside = env.inside
-    lengths = {*arrays, *np.shape(inside.no_action), inside.output_count}
-    lengths |= {len(inside.start_inputs), len(inside.readings.outputs)}
+    lengths = {*arrays, *np.shape(env._conversions.no_action), env.interface.output_count}
+    lengths |= {len(env.interface.start_inputs), len(env._episode.outputs)}
     for part in _boxes(env.observation_space):
         lengths |= set(part.shape)
     for value in env.variables.values():
@@ -281,16 +283,13 @@ def _batches(rows: Sequence[_Row], count: int) -> Iterator[list[_Row]]:
         yield chosen
 
 
-def _batch_of(env: FMUEnv, rows: Sequence[_Row], name: str) -> Readings:
+def _batch_of(env: FMUEnv, rows: Sequence[_Row], name: str) -> Episode:
     """What a hook reads in environments, in arrays."""
     batch = batched(env, len(rows))
     states = [_moment(env, row, name) for row in rows]
     for index, one in enumerate(states):
-        batch.outputs[:, index], batch.previous_state[:, index] = one.outputs, one.previous_state
-        batch.inputs[:, index], batch.step_count[index] = one.inputs, one.step_count
-        batch.action[..., index] = one.action
-        batch.previous_action[..., index] = one.previous_action
-        batch.done[index] = one.done
+        for quantity in _READ_ONLY:
+            getattr(batch, quantity)[..., index] = getattr(one, quantity)
     for variable in batch.variables:
         values = np.array([one.variables[variable] for one in states])
         batch.variables[variable] = np.moveaxis(values, 0, -1).copy()
@@ -305,15 +304,15 @@ def _array_of(values: list[Any]) -> Any:
     return np.array(values, object if isinstance(values[0], str) else None)
 
 
-def _moment(env: FMUEnv, row: _Row, name: str) -> Readings:
+def _moment(env: FMUEnv, row: _Row, name: str) -> Episode:
     """What a hook reads in one environment: not all is known yet when the first are called."""
-    now = row.readings
+    now = row.episode
     if name not in _WRITING:
         return now.replaced(done=row.done and name != "_is_done")
     variables = _variables(row.before)
     if name == "_update":
         return now.replaced(variables=variables, done=False)
-    values = (*now.previous_state, *now.outputs[env.inside.output_count :])
+    values = (*now.previous_state, *now.outputs[env.interface.output_count :])
     return now.replaced(variables=variables, outputs=values, done=False)
 
 
@@ -362,18 +361,18 @@ class _Comparison:
         count = len(self.rows)
         return f"on the arrays of {count} environment{'s' if count > 1 else ''}"
 
-    def _alone(self, batch: Readings) -> dict[int, Any]:
+    def _alone(self, batch: Episode) -> dict[int, Any]:
         """The results one environment at a time, as far as there are any."""
         found: dict[int, Any] = {}
         for index, row in enumerate(self.rows):
             try:
-                found[index] = self._called(ColumnReadings(batch, index).copy(), self._of_one)
+                found[index] = self._called(EpisodeColumn(batch, index).copy(), self._of_one)
             except _FailureError as failure:
                 if row.kind != "limit" and self._counts(row):
                     raise _DifferenceError(f"fails for one environment: {failure}") from None
         return found
 
-    def _together(self, batch: Readings) -> Any:
+    def _together(self, batch: Episode) -> Any:
         try:
             return self._called(batch.mapped(lambda values: np.array(values)), self._of_many)
         except _FailureError as failure:
@@ -394,7 +393,7 @@ class _Comparison:
             return self.name in _AT_STARTS
         return row.kind != "failed"
 
-    def _called(self, readings: Readings, of: Callable[[Any], Any]) -> Any:
+    def _called(self, episode: Episode, of: Callable[[Any], Any]) -> Any:
         """Call the hook; return its result, if it has changed only what it may.
 
         Raises:
@@ -402,12 +401,12 @@ class _Comparison:
             _FailureError: If the hook fails, or returns what cannot be used.
         """
         env = self.env
-        before, attributes = _values_in(readings, self.name), dict(vars(env))
-        plain = plain_attributes(attributes, env.inside.own_names)
+        before, attributes = _values_in(episode, self.name), dict(vars(env))
+        plain = plain_attributes(attributes, env._own_names)
         try:
-            with reading(env, readings):
+            with standing_in(env, episode):
                 value = of(getattr(env, self.name)())
-                after = _values_in(env.inside.readings.copy(), self.name)
+                after = _values_in(env._episode.copy(), self.name)
             _require_unchanged(before, after)
             _require_attributes(env, attributes, plain)
             return value
@@ -426,7 +425,7 @@ class _Comparison:
         """The result in one environment."""
         match self.name:
             case "_get_inputs":
-                return flat_inputs(value, self.env.inside.interface.inputs, shown)
+                return flat_inputs(value, self.env.interface.inputs, shown)
             case "_update":
                 return {name: np.asarray(one) for name, one in self.env.variables.items()}
             case "_is_done" | "_is_truncated":
@@ -442,7 +441,7 @@ class _Comparison:
         env, count = self.env, len(self.rows)
         match self.name:
             case "_get_inputs":
-                inputs = np.empty((len(env.inside.start_inputs), count))
+                inputs = np.empty((len(env.interface.start_inputs), count))
                 hook_results.write_inputs(value, inputs)
                 return inputs.T
             case "_update":
@@ -482,17 +481,17 @@ def _require_attributes(env: FMUEnv, before: Mapping[str, Any], plain: Mapping[s
     """Raise a ``_DifferenceError`` if a hook has kept something in an attribute."""
     now = vars(env)
     new = [name for name, value in now.items() if name not in before or before[name] is not value]
-    new += changed(plain_attributes(now, env.inside.own_names), plain)
+    new += changed(plain_attributes(now, env._own_names), plain)
     for name in new:
-        if name not in env.inside.own_names:
+        if name not in env._own_names:
             raise _DifferenceError(f"changes self.{name}, which belongs in 'episode_variables'")
 
 
-def _values_in(readings: Readings, hook: str) -> dict[str, Any]:
+def _values_in(episode: Episode, hook: str) -> dict[str, Any]:
     """Copies of what a hook must not change."""
-    kept: dict[str, Any] = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
+    kept: dict[str, Any] = {name: np.copy(getattr(episode, name)) for name in _READ_ONLY}
     if hook not in _WRITING:
-        kept["variables"] = {name: np.copy(one) for name, one in readings.variables.items()}
+        kept["variables"] = {name: np.copy(one) for name, one in episode.variables.items()}
     return kept
 
 

@@ -15,7 +15,7 @@ from fmugym.expressions.lowering import Store, compile_graph
 from fmugym.expressions.program import Program, UncompilableError, letter_of
 from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
-from fmugym.task.inside import is_overridden
+from fmugym.task.own_hooks import is_overridden
 from fmugym.task.step import ORDER
 from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
 
@@ -30,10 +30,9 @@ _Seen = tuple[SeenArray, list[Value]]
 
 def formulas_of(env: FMUEnv) -> Formulas | None:
     """The formulas that all hooks of a step are; None if the class overrides one of them."""
-    inside = env.inside
     hooks = (*ORDER, "_goal_reward")
-    is_own = any(is_overridden(env, inside.base, hook) for hook in hooks)
-    return None if is_own else inside.formulas
+    is_own = any(is_overridden(env, hook) for hook in hooks)
+    return None if is_own else env.formulas
 
 
 def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
@@ -46,7 +45,7 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
     Raises:
         UncompilableError: If programs do not have its actions or observations, or it is too long.
     """
-    if env.inside.pool_tells:
+    if env._instance.tells:
         raise UncompilableError("the pool tells infos of its own")
     letter_of(np.dtype(env.action_space.dtype))
     judgement, seen, updated = _Judgement(env, formulas).made()
@@ -102,7 +101,7 @@ class Translation:
         """The FMU's inputs, each rounded to its type."""
         given = formulas.inputs
         inputs = self._elements_of_action() if given is None else map(self.of, given)
-        variables = self._env.inside.interface.inputs
+        variables = self._env.interface.inputs
         return [to_input_type(v, value.number) for v, value in zip(variables, inputs, strict=True)]
 
     def observation(self, formulas: Formulas) -> list[Value]:
@@ -115,7 +114,7 @@ class Translation:
         if not isinstance(space, spaces.Box | spaces.MultiBinary):
             raise UncompilableError(f"programs make no observations of {space}")
         if formulas.observation is None:
-            count = self._env.inside.output_count
+            count = self._env.interface.output_count
             elements = [self.quantity("outputs", place) for place in range(count)]
         else:
             elements = [self.of(one) for one in formulas.observation]
@@ -123,7 +122,7 @@ class Translation:
 
     def _elements_of_action(self) -> list[Value]:
         """The numbers that the default of ``_get_inputs`` gives."""
-        space, values = self._env.action_space, self._env.inside.action_values
+        space, values = self._env.action_space, self._env._conversions.action_values
         count = int(np.prod(space.shape or (), dtype=int))
         elements = [self._loaded("action", index) for index in range(count)]
         if isinstance(values, range):
@@ -167,11 +166,11 @@ class Translation:
 
     def _time(self) -> Value:
         """The time of the FMU, as ``FMUEnv.time`` computes it."""
-        env, spec = self._env, self._env.inside.spec
+        env, spec = self._env, self._env.pool_spec
         start: Value | float = spec.start_time
         if env.config.draws_start_time:
             start = self._row("parameter", "start_time", 0)
-        count: Value = (self.quantity("step_count") + env.inside.warm_up_steps) * spec.substeps
+        count: Value = (self.quantity("step_count") + env.warm_up_steps) * spec.substeps
         return count * spec.time_step / spec.substeps + start
 
 
@@ -257,8 +256,9 @@ class _Judgement:
     def _seen(self) -> list[_Seen]:
         """The info if there is one, and the observation unless the pool makes it."""
         env, values = self._env, self._values()
-        parts = [*_named(("info",), self._formulas.info, values)] if env.inside.has_info else []
-        if env.inside.pool_observes and not parts:
+        conversions, info = env._conversions, self._formulas.info
+        parts = [*_named(("info",), info, values)] if conversions.has_info else []
+        if conversions.pool_observes and not parts:
             return []
         elements = values.observation(self._formulas)
         dtype = np.dtype(env.observation_space.dtype)

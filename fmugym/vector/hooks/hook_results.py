@@ -17,8 +17,8 @@ from gymnasium import spaces
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.task.episode import EpisodeDraws
-from fmugym.task.readings import environments_first
+from fmugym.task.episode import environments_first
+from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
 
@@ -163,7 +163,7 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
     return array if array.ndim else np.full(count, array)
 
 
-def type_of_variable(draws: EpisodeDraws, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
+def type_of_variable(draws: EpisodeStart, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
     """The type in which N environments keep an episode variable.
 
     It is the type that ``_update`` assigns if this can hold the value with which episodes start.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,9 +11,10 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.expressions.program import LETTERS, Row
+from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.base import FloatArray, MaskArray, Play, Pool
-from fmugym.task.episode import Draw
-from fmugym.task.readings import Readings
+from fmugym.task.episode import Episode
+from fmugym.task.episode_start import Draw
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.task_programs import TaskPrograms
 
@@ -22,30 +23,35 @@ __all__ = ["Memory"]
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
 
+_KEPT_BY_THE_POOL: Final = frozenset({"previous_state", "previous_action"})
+"""The quantities before the step that the pool keeps by itself, from ``kept`` and ``actions``."""
+
 
 class Memory:
     """The arrays of N environments that compiled steps read and write in place.
 
     Args:
         env: An environment, for what all have in common.
-        readings: What the hooks of all read; its arrays become those that steps keep.
+        episodes: What the hooks of all read; its arrays become those that steps keep.
         ended: Which episodes have ended, shape (N,).
 
     Attributes:
         ended: As given.
         parameters: The rows of the parameters by name; to be set before steps.
+        given: The inputs that hooks on arrays have made, shape (m, N).
         kept: The outputs before the step, shape (k, N).
         actions: Those of this step and of the one before, environments first.
         variables: The episode variables by name, environments last.
         before: The same before the step.
     """
 
-    def __init__(self, env: FMUEnv, readings: Readings, ended: MaskArray) -> None:
-        self._env, self._readings = env, readings
+    def __init__(self, env: FMUEnv, episodes: Episode, ended: MaskArray) -> None:
+        self._env, self._episodes = env, episodes
         self._n = len(ended)
-        self.ended, self.parameters = ended, readings.parameters
-        self.kept, self._done = np.zeros_like(readings.outputs), np.zeros(self._n, np.bool_)
-        self.actions = _copied(readings.action), _copied(readings.previous_action)
+        self.ended, self.parameters = ended, episodes.parameters
+        self.given = np.zeros_like(episodes.inputs)
+        self.kept, self._done = np.zeros_like(episodes.outputs), np.zeros(self._n, np.bool_)
+        self.actions = _copied(episodes.action), _copied(episodes.previous_action)
         self.variables: dict[str, npt.NDArray[Any]] = {}
         self.before: dict[str, npt.NDArray[Any]] = {}
 
@@ -53,7 +59,7 @@ class Memory:
         """Make the arrays of the episode variables in the types that programs store."""
         self.variables, self.before = {}, {}
         for name, dtype in task.variables.items():
-            row = hook_results.variable(name, self._readings.variables[name], self._n)
+            row = hook_results.variable(name, self._episodes.variables[name], self._n)
             self.variables[name] = np.ascontiguousarray(row, dtype).copy()
             self.before[name] = self.variables[name].copy()
         self.show()
@@ -66,7 +72,7 @@ class Memory:
 
     def show(self) -> None:
         """Let hooks on arrays read what the pool keeps."""
-        read, width = self._readings, self._env.inside.output_count
+        read, width = self._episodes, self._env.interface.output_count
         read.action, read.previous_action = (np.moveaxis(a, 0, -1) for a in self.actions)
         self.kept[:width] = read.previous_state
         read.previous_state = self.kept[:width]
@@ -77,7 +83,7 @@ class Memory:
     def keep_done(self, done: MaskArray) -> None:
         """Keep which tasks have ended, which a hook on arrays has told."""
         self._done[:] = done
-        self._readings.done = self._done
+        self._episodes.done = self._done
 
     def prepare(
         self,
@@ -104,12 +110,12 @@ class Memory:
         flags, real = ((self._n,), self._done.dtype), np.dtype(np.float64)
         judged = ((self._n,), real), flags, flags, flags
         return pool.prepare_play(
-            self._env.inside.draws.model_variables,
+            self._env.episode_start.model_variables,
             (task.inputs.with_rows(self.find), task.judgement.with_rows(self.find)),
             self._action_group(),
             starts,
             (native, streams),
-            (self._readings.step_count, self.ended, limit),
+            (self._episodes.step_count, self.ended, limit),
             self._surroundings(
                 task, drawn, (*kinds, (*shapes, *judged, ((len(drawn), self._n), real)), late)
             ),
@@ -122,15 +128,19 @@ class Memory:
         name: Any = rest[0]
         match kind:
             case "output":
-                return self._readings.outputs[index]
+                return self._episodes.outputs[index]
             case "kept":
                 return self.kept[index]
             case "input":
-                return self._readings.inputs[index]
+                return self._episodes.inputs[index]
             case "parameter":
                 return self.parameters[name]
+            case "given":
+                return self.given[index]
             case "step_count":
-                return self._readings.step_count
+                return self._episodes.step_count
+            case str() if kind in PREVIOUS:
+                return _row(getattr(self._episodes, kind), index)
         arrays = self.variables if kind == "variable" else self.before
         return arrays[name].reshape(-1, self._n)[index]
 
@@ -155,7 +165,7 @@ class Memory:
             "highest": high,
             "current": flat[0],
             "previous": flat[1],
-            "none": np.array(env.inside.no_action, dtype).reshape(-1),
+            "none": np.array(env._conversions.no_action, dtype).reshape(-1),
         }
 
     def _surroundings(
@@ -168,7 +178,7 @@ class Memory:
             drawn: What the pool draws.
             results: How it makes results.
         """
-        env, draws = self._env, self._env.inside.draws
+        env, draws, read = self._env, self._env.episode_start, self._episodes
         names = draws.parameter_names
         flat = {name: row.reshape(-1, self._n) for name, row in self.variables.items()}
         before = {name: row.reshape(-1, self._n) for name, row in self.before.items()}
@@ -177,12 +187,18 @@ class Memory:
             "kept": self.kept,
             "done": self._done,
             "reads_kept": task.judgement.loads("kept"),
-            "copies": tuple(
+            "before_inputs": tuple(
+                (_row(getattr(read, now), index), _row(getattr(read, name), index))
+                for name, now in PREVIOUS.items()
+                if name not in _KEPT_BY_THE_POOL
+                for index in range(max(1, getattr(read, name).size // self._n))
+            ),
+            "before_judgement": tuple(
                 pair for name in flat for pair in zip(flat[name], before[name], strict=True)
             ),
             "input_starts": tuple(
                 (names.index(name), start) if name in names else (-1, start)
-                for name, start in env.inside.start_inputs
+                for name, start in env.interface.start_inputs
             ),
             "drawn_variables": tuple(
                 (flat[draw.name][draw.element or 0], number)
@@ -197,6 +213,12 @@ class Memory:
             ),
             "results": results,
         }
+
+
+def _row(array: npt.NDArray[Any], index: int) -> npt.NDArray[Any]:
+    """The row of an element of a quantity, shape (N,)."""
+    row: npt.NDArray[Any] = array.reshape(-1, array.shape[-1])[index]
+    return row
 
 
 def _copied(actions: Any) -> npt.NDArray[Any]:

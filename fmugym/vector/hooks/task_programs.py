@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
 from fmugym.expressions.graph import Graph
-from fmugym.expressions.lowering import compile_graph
+from fmugym.expressions.lowering import Store, compile_graph
 from fmugym.expressions.program import Program
 from fmugym.expressions.value import Value, where
 
@@ -53,18 +53,22 @@ class TaskPrograms:
     updated: tuple[str, ...]
 
     @classmethod
-    def without_programs(cls, variables: Iterable[str]) -> TaskPrograms:
-        """A task whose hooks run on arrays; a program only passes on that an FMU stops.
+    def without_programs(cls, variables: Iterable[str], inputs: int) -> TaskPrograms:
+        """A task whose hooks run on arrays; programs pass on inputs, and that an FMU stops.
 
         Args:
             variables: The names of the episode variables, which are float64 at first.
+            inputs: The number of inputs.
         """
         graph, flag = Graph(), np.dtype(np.bool_)
         stopped = graph.load("stopped", None, flag)
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
         judgement = compile_graph(graph, [], [stopped, *others], 0)
         types = dict.fromkeys(variables, np.dtype(np.float64))
-        return cls(compile_graph(Graph(), [], [], 0), judgement, (), types, ())
+        graph = Graph()
+        given = [graph.load("row", ("given", i), np.dtype(np.float64)) for i in range(inputs)]
+        stores = [Store(node, ("input", i)) for i, node in enumerate(given)]
+        return cls(compile_graph(graph, stores, [], 0), judgement, (), types, ())
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TaskPrograms:
         """The same task with other tables, by the bytes of those whose place they take."""

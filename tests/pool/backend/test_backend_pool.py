@@ -297,7 +297,7 @@ def test_its_own_thread_may_close_a_pool():
     rig = Held()
     env = RigEnv(rig)
     env.reset()
-    pool = env.inside.pool
+    pool = env.pool
     pool._threads[0].ask(lambda _: pool.close(), None).result(10)
     assert rig.calls == ["reset", "stop"]
     env.close()
@@ -402,7 +402,7 @@ def test_what_is_no_backend(backend, text):
 
 def test_a_name_chooses_how_the_fmu_is_stepped():
     env = RigEnv("fmpy")
-    assert not env.inside.pool.is_real
+    assert not env.pool.is_real
     env.close()
 
 
@@ -480,7 +480,7 @@ def test_hooks_of_several_real_plants(hooks, mode):
     ours = FMUVectorEnv(
         in_way(hooks, lambda: RigEnv(made_at_once, **config)), 3, autoreset_mode=mode
     )
-    assert ours.inside.engine.way == hooks
+    assert ours.engine.way == hooks
     theirs = SyncVectorEnv([lambda: RigEnv(Oscillator(), **config)] * 3, autoreset_mode=mode)
     assert run_side_by_side(ours, theirs, 40) > 9
 
@@ -600,7 +600,7 @@ class TestPacing:
         clock.advance(1.0)
         assert not rig.has_held.wait(0.05)
         env.reset()
-        env.inside.halt()
+        env.pool.halt()
         clock.advance(1.0)
         assert not rig.has_held.wait(0.05)
         env.close()

@@ -75,7 +75,7 @@ class TestForks:
         env.reset()
         for _ in range(2):
             assert not env.step([1.0])[3]
-        os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+        os.kill(env.pool.processes()[0], signal.SIGKILL)
         assert "SIGKILL" in env.step([1.0])[4]["fault"]
 
     @pytest.mark.parametrize("fault", ["fork", "fork_and_loop"])
@@ -120,7 +120,7 @@ from fmugym.pool.process.launcher import _guard
 env = process_tools.FaultyEnv(sys.argv[1])
 env.reset()
 env.step([1.0])
-print(*env.inside.pool.processes(), _guard().pid, flush=True)
+print(*env.pool.processes(), _guard().pid, flush=True)
 """
 
 
@@ -154,7 +154,7 @@ kill_in(*sys.argv[2:5], int(sys.argv[5]))
 env = process_tools.FaultyEnv(sys.argv[1])
 env.reset()
 env.step([1.0])
-os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+os.kill(env.pool.processes()[0], signal.SIGKILL)
 assert env.step([1.0])[3]
 env.reset()
 env.close()
@@ -351,7 +351,7 @@ class TestEndOfParent:
                 sys.exit(0)
             os.waitpid(child, 0)
             print(env.step([1.0])[0])
-            os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+            os.kill(env.pool.processes()[0], signal.SIGKILL)
             print("SIGKILL" in env.step([1.0])[4]["fault"])
             env.reset()
             print(env.step([1.0])[0])

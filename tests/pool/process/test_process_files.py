@@ -115,7 +115,7 @@ class TestTexts:
             Path(name).write_text("7")
         env = make_env(isolation="process", model_parameters={"label": text})
         env.reset()
-        (pid,) = env.inside.pool.processes()
+        (pid,) = env.pool.processes()
         scratch = Path(f"/proc/{pid}/cwd")
         assert (scratch / text).read_text() == "7"
         assert not (scratch / "other.txt").exists()
@@ -126,5 +126,5 @@ class TestTexts:
     def test_that_name_no_file(self, make_env, directory, text):
         env = make_env(isolation="process", model_parameters={"label": text})
         env.reset()
-        (pid,) = env.inside.pool.processes()
+        (pid,) = env.pool.processes()
         assert os.listdir(f"/proc/{pid}/cwd") == []

@@ -161,7 +161,7 @@ class TestSingle:
     def test_the_end_of_an_instance(self, make_env, stage, caplog):
         env = make_env("crash", stage)
         env.reset()
-        (pid,) = env.inside.pool.processes()
+        (pid,) = env.pool.processes()
         env.close()
         assert not is_alive(pid)
         assert "SIGSEGV in its end" in caplog.text
@@ -190,7 +190,7 @@ class TestSingle:
     def test_pickles_with_its_isolation(self, make_env, opened):
         env = make_env("crash")
         twin = opened(pickle.loads(pickle.dumps(env)))
-        assert twin.inside.pool.processes() != env.inside.pool.processes()
+        assert twin.pool.processes() != env.pool.processes()
         for one in (env, twin):
             one.reset()
             assert one.step([1.0])[0] == [0.5]
@@ -363,7 +363,7 @@ class TestKilledFromOutside:
         envs = make_envs(lambda: FaultyEnv(faulty), 3, workers=3)
         envs.reset()
         envs.step(np.ones((3, 1), np.float32))
-        os.kill(envs.inside.pool.processes()[1], signal.SIGKILL)
+        os.kill(envs.pool.processes()[1], signal.SIGKILL)
         killing(request_, 2)
         truncated, infos = envs.step(np.ones((3, 1), np.float32))[3:]
         assert truncated.tolist() == [False, True, False]
