@@ -98,6 +98,7 @@ class FMUEnv(Constructed):
             type of the action space; zeros after a reset.
         inputs: The FMU's inputs in this step, floats.
         previous_state: ``state`` before this step.
+        previous_inputs: ``inputs`` of the step before; in the first, their start values.
         previous_action: The action of the step before; zeros in the first.
         step_count: Steps since the reset.
         done: What ``_is_done`` returned in this step.

@@ -67,6 +67,15 @@ QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
             "previous_outputs", "previous_state", "states", _FLOAT, "output", "kept", of="state"
         ),
         EpisodeQuantity("inputs", "inputs", "inputs", _FLOAT, "input", "input", array="inputs"),
+        EpisodeQuantity(
+            "previous_inputs",
+            "previous_inputs",
+            "inputs",
+            _FLOAT,
+            "previous_inputs",
+            "previous_inputs",
+            of="inputs",
+        ),
         EpisodeQuantity("action", "action", "action"),
         EpisodeQuantity("previous_action", "previous_action", "action", of="action"),
         EpisodeQuantity("step_count", "step_count", "number", _COUNT, "step_count", "step_count"),

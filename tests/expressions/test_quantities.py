@@ -1,11 +1,15 @@
 """The table of quantities: expressions read the same of an episode as hooks do."""
 
+import contextlib
 import operator
 
+import gymnasium
+import numpy as np
 import pytest
-from ways import in_way
+from ways import ALL_WAYS, in_python, in_way
 
 import fmugym
+from fmugym.archive.bundled import bundled_fmu
 from fmugym.expressions.quantities import QUANTITIES
 
 TASK = {
@@ -30,7 +34,7 @@ TASK = {
 }
 """A term for each quantity but those of ``ELSEWHERE``."""
 
-ELSEWHERE = {"inputs", "after_end"}
+ELSEWHERE = {"inputs", "previous_inputs", "after_end"}
 """Task files have the actions in the place of inputs. Only classes go on after an end."""
 
 KEYS = {
@@ -70,3 +74,76 @@ def test_of_many_environments(make_envs):
             rows = envs.get_attr("state" if attribute == "outputs" else attribute)
             expected = [row[KEYS[name]] if name in KEYS else row for row in rows]
             assert infos["reward_terms"][name].tolist() == expected, name
+
+
+class Pushed(fmugym.FMI2CSEnv):
+    """The pendulum, driven by twice the action."""
+
+    def __init__(self):
+        told = {"now": "tau", "before": "previous(tau)"}
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["theta", "theta_dot"],
+            "model_parameters": {"theta_0": fmugym.distributions.Uniform(-3.0, 3.0)},
+            "bounds": {"tau": (-2, 2)},
+            "time_step": 0.05,
+            "inputs": {"tau": "2 * action[0]"},
+            "info": told,
+            "terminated": "abs(theta) > 3",
+            "max_episode_steps": 7,
+        }
+        super().__init__(bundled_fmu("Pendulum"), config)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_inputs_of_the_step_before_in_one_environment(is_compiled):
+    with contextlib.closing(Pushed() if is_compiled else in_python(Pushed())) as env:
+        env.action_space.seed(1)
+        for seed in range(3):
+            env.reset(seed=seed)
+            assert env.previous_inputs == (0.0,)
+            before, ended = 0.0, False
+            while not ended:
+                *_, terminated, truncated, info = env.step(env.action_space.sample())
+                ended = terminated or truncated
+                assert info["before"] == before == env.previous_inputs[0]
+                assert info["now"] == env.inputs[0] != before
+                before = info["now"]
+        assert env.is_compiled == is_compiled
+
+
+@pytest.mark.parametrize("mode", gymnasium.vector.AutoresetMode)
+@pytest.mark.parametrize("way", ALL_WAYS)
+def test_inputs_of_the_step_before_in_many(way, mode, make_envs):
+    """A snapshot of the middle goes on with the same ones."""
+    envs = make_envs(in_way(way, Pushed), 3, autoreset_mode=mode)
+    envs.reset(seed=1)
+    envs.action_space.seed(1)
+    before, ends = np.zeros(3), 0
+    for step in range(40):
+        fresh = envs.engine.ended.copy()
+        if mode is gymnasium.vector.AutoresetMode.DISABLED and fresh.any():
+            envs.reset(options={"reset_mask": fresh})
+            before[fresh], fresh[:] = 0.0, False
+        _, _, terminated, truncated, infos = envs.step(envs.action_space.sample())
+        ended = terminated | truncated
+        ends += int(ended.sum())
+        stepped = ~fresh
+        told = infos
+        if mode is gymnasium.vector.AutoresetMode.SAME_STEP and ended.any():
+            told = {
+                name: np.where(ended, infos["final_info"][name], infos[name])
+                for name in infos
+                if name in ("now", "before")
+            }
+        assert told["before"][stepped].tolist() == before[stepped].tolist(), step
+        before = np.where(stepped, told["now"], 0.0)
+        if mode is gymnasium.vector.AutoresetMode.SAME_STEP:
+            before[ended] = 0.0
+        if step == 20:
+            snapshot = envs.save_state()
+            envs.restore_state(snapshot)
+    assert ends > 6
