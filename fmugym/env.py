@@ -101,6 +101,7 @@ class FMUEnv(Constructed):
         previous_inputs: ``inputs`` of the step before; in the first, their start values.
         previous_action: The action of the step before; zeros in the first.
         step_count: Steps since the reset.
+        fmu_status: The status of the FMU's last step; see ``fmugym.fmi.status.Status``.
         done: What ``_is_done`` returned in this step.
         after_end: Whether this step began after the end of the episode.
         parameters: The parameters of this episode by name.

@@ -17,6 +17,7 @@ __all__ = ["KEPT", "PREVIOUS", "QUANTITIES", "EpisodeQuantity"]
 
 _FLOAT: Final = np.dtype(np.float64)
 _COUNT: Final = np.dtype(np.int64)
+_STATUS: Final = np.dtype(np.int32)
 _FLAG: Final = np.dtype(np.bool_)
 
 
@@ -79,6 +80,7 @@ QUANTITIES: Final[Mapping[str, EpisodeQuantity]] = {
         EpisodeQuantity("action", "action", "action"),
         EpisodeQuantity("previous_action", "previous_action", "action", of="action"),
         EpisodeQuantity("step_count", "step_count", "number", _COUNT, "step_count", "step_count"),
+        EpisodeQuantity("fmu_status", "fmu_status", "number", _STATUS, array="statuses"),
         EpisodeQuantity("time", "time", "derived"),
         EpisodeQuantity("done", "done", "number", _FLAG),
         EpisodeQuantity("after_end", "after_end", "number", _FLAG),

@@ -37,7 +37,7 @@ def judged(env: Constructed, status: int, values: tuple[float, ...] | None = Non
         ConfigError: If a hook returns something unusable.
         SimulationError: After a fault with ``on_fault="raise"``.
     """
-    stopped = False
+    env._episode.fmu_status, stopped = status, False
     if status:
         stopped = status == _TERMINATED
         if status > WARNING_CODE and not stopped:

@@ -11,6 +11,7 @@ from ways import ALL_WAYS, in_python, in_way
 import fmugym
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.expressions.quantities import QUANTITIES
+from fmugym.fmi.status import Status
 
 TASK = {
     "fmu": {"bundled": "Pendulum"},
@@ -34,8 +35,9 @@ TASK = {
 }
 """A term for each quantity but those of ``ELSEWHERE``."""
 
-ELSEWHERE = {"inputs", "previous_inputs", "after_end"}
-"""Task files have the actions in the place of inputs. Only classes go on after an end."""
+ELSEWHERE = {"inputs", "previous_inputs", "fmu_status", "after_end"}
+"""Task files have the actions in the place of inputs, and no name of the status. Only classes go
+on after an end."""
 
 KEYS = {
     **dict.fromkeys(("outputs", "previous_outputs", "action", "previous_action"), 0),
@@ -147,3 +149,44 @@ def test_inputs_of_the_step_before_in_many(way, mode, make_envs):
             snapshot = envs.save_state()
             envs.restore_state(snapshot)
     assert ends > 6
+
+
+class Failing(fmugym.FMI2CSEnv):
+    """The cart-pole, which discards steps of absurd forces."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": "x",
+            "time_step": 0.02,
+            "terminated": False,
+        }
+        super().__init__(bundled_fmu("CartPole"), config)
+
+    def _get_action_space(self):
+        return gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+
+
+@pytest.mark.parametrize("is_compiled", [True, False])
+def test_status_of_one_fmu(is_compiled):
+    with contextlib.closing(Failing() if is_compiled else in_python(Failing())) as env:
+        for _ in range(2):
+            env.reset(seed=0)
+            told = [env.fmu_status]
+            for force in (1.0, 1e30):
+                env.step([force])
+                told.append(env.fmu_status)
+            assert told == [Status.OK, Status.OK, Status.DISCARD]
+
+
+@pytest.mark.parametrize("way", ALL_WAYS)
+def test_status_of_many_fmus(way, make_envs):
+    envs = make_envs(in_way(way, Failing), 3)
+    envs.reset(seed=0)
+    for forces in ([1.0, 1.0, 1.0], [1.0, 1e30, 1.0], [1.0, 1.0, 1e30]):
+        envs.step(np.array(forces)[:, None])
+        wanted = [Status.DISCARD if force > 1 else Status.OK for force in forces]
+        assert [*envs.get_attr("fmu_status")] == wanted
+    (second,) = envs.save_state(2)
+    envs.restore_state(second)
+    assert [*envs.get_attr("fmu_status")] == [Status.DISCARD] * 3
