@@ -27,9 +27,8 @@ __all__ = [
 ]
 
 KEPT_NAMES: Final = tuple(one.attribute for one in KEPT)
-_AT_ACTION: Final = (*PREVIOUS, "action", "inputs")
-_at_action: Final = attrgetter(*_AT_ACTION)
-"""The quantities that a new action changes."""
+_present: Final = attrgetter(*PREVIOUS.values())
+"""The values that are kept when a step begins."""
 
 _NUMBERS: Final = [(one.attribute, one.zero) for one in KEPT if one.shape == "number"]
 """Counts and flags, which are zero in an episode that begins."""
@@ -49,13 +48,17 @@ class Episode:
     Attributes:
         out: As given.
         width: As given.
+        previous: The values before the step, in the order of ``PREVIOUS``; each also has a name.
         state: The outputs only.
         outputs: With the monitored variables.
         previous_state, inputs, action, previous_action, step_count, done, after_end, parameters,
             variables: See ``FMUEnv``.
     """
 
-    __slots__ = (*KEPT_NAMES, "out", "parameters", "state", "variables", "width")
+    __slots__ = (
+        *(name for name in KEPT_NAMES if name not in PREVIOUS),
+        *("out", "parameters", "previous", "state", "variables", "width"),
+    )
 
     if TYPE_CHECKING:
         out: NamedValues
@@ -64,19 +67,15 @@ class Episode:
         variables: EpisodeVariables
         outputs: Any
         state: Any
-        previous_state: Any
+        previous: tuple[Any, ...]
         inputs: Any
         action: Any
-        previous_action: Any
-        step_count: Any
-        done: Any
-        after_end: Any
 
         def __getattr__(self, name: str) -> Any: ...
         def __setattr__(self, name: str, value: Any) -> None: ...
 
     def __init__(self, out: NamedValues, width: int, **values: Any) -> None:
-        self.out, self.width = out, width
+        self.out, self.width, self.previous = out, width, (None,) * len(PREVIOUS)
         for name, value in values.items():
             setattr(self, name, value)
         self.state = self.outputs[:width]
@@ -140,15 +139,29 @@ class Episode:
         Returns:
             What ``take_back`` takes to return to before, if the FMU has not stepped.
         """
-        before = _at_action(self)
-        for name, now in PREVIOUS.items():
-            setattr(self, name, getattr(self, now))
+        before = self.previous, self.action, self.inputs
+        self.previous = _present(self)
         return before
 
     def take_back(self, before: tuple[Any, ...]) -> None:
-        """Return to before ``keep``, and to the action and the inputs of then."""
-        for name, value in zip(_AT_ACTION, before, strict=True):
-            setattr(self, name, value)
+        """Return to before ``keep``: to the action and the inputs of then, too."""
+        self.previous, self.action, self.inputs = before
+
+
+def _previous_value(place: int) -> Any:
+    """Make a property that is one of the values before the step."""
+
+    def get(self: Episode) -> Any:
+        return self.previous[place]
+
+    def put(self: Episode, value: Any) -> None:
+        self.previous = (*self.previous[:place], value, *self.previous[place + 1 :])
+
+    return property(get, put)
+
+
+for _place, _name in enumerate(PREVIOUS):
+    setattr(Episode, _name, _previous_value(_place))
 
 
 class NoEpisode:

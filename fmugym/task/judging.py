@@ -37,26 +37,26 @@ def judged(env: Constructed, status: int, values: tuple[float, ...] | None = Non
         ConfigError: If a hook returns something unusable.
         SimulationError: After a fault with ``on_fault="raise"``.
     """
-    env._episode.fmu_status, stopped = status, False
+    read, instance, conversions = env._episode, env._instance, env._conversions
+    read.fmu_status, stopped = status, False
     if status:
         stopped = status == _TERMINATED
         if status > WARNING_CODE and not stopped:
-            return _fault(env, env._instance.pool.failure(0))
-    read = env._episode
+            return _fault(env, instance.pool.failure(0))
     variables = read.variables.copy() if env._own_hooks.update else None
     before = read.outputs
     if values is None:
-        values = tuple(env._instance.outputs.tolist())  # Python's floats are faster
+        values = tuple(instance.outputs.tolist())  # Python's floats are faster
     read.outputs = values
-    read.state = values if not env.interface.monitors else values[: env.interface.output_count]
-    observed = env._instance.observation.copy() if env._conversions.pool_observes else None
+    read.state = values[: read.width]
+    observed = instance.observation.copy() if conversions.pool_observes else None
     cut_off = read.step_count >= env.step_limit
     observation, reward, terminated, truncated = conclude(env, NUMBERS, stopped, cut_off, observed)
     # One call for all numbers, which is enough for nearly all steps.
     is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
-    if not is_small and not (isfinite(reward) and env._conversions.is_finite(observation)):
+    if not is_small and not (isfinite(reward) and conversions.is_finite(observation)):
         return _fault_of_hooks(env, reward, observation, (before, variables))
-    info = info_of(env) if env._conversions.has_info else {}
+    info = info_of(env) if conversions.has_info else {}
     if stopped:
         info["fmu_terminated"] = True
     if terminated or truncated:

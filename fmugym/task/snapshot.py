@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.expressions.quantities import KEPT
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 
 __all__ = [
@@ -25,8 +26,8 @@ __all__ = [
     "taken",
 ]
 
-_VERSION: Final = 4
-"""Of pickles; it changes with their content."""
+_VERSION: Final = f"4 ({', '.join(one.attribute for one in KEPT)})"
+"""Of pickles; it changes with their content, of which the quantities are a part."""
 
 _HASH: Final = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{8,}\b")
 
@@ -136,7 +137,7 @@ class Snapshot:
         return self._bundle
 
 
-def _unpickled(version: int, *parts: Any) -> Snapshot:
+def _unpickled(version: str, *parts: Any) -> Snapshot:
     if version != _VERSION:
         raise SimulationError(
             f"the snapshot was pickled in version {version} of the format, expected {_VERSION}"

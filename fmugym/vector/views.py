@@ -170,6 +170,18 @@ class EpisodeColumn(Episode):
         """See ``Episode.look``; the arrays have the outputs already."""
         keep_rows(self.batch, self.index)
 
+    def keep(self) -> tuple[Any, ...]:
+        """See ``Episode.keep``."""
+        before = [getattr(self, name) for name in PREVIOUS], self.action, self.inputs
+        keep_rows(self.batch, self.index)
+        return before
+
+    def take_back(self, before: tuple[Any, ...]) -> None:
+        """See ``Episode.take_back``."""
+        values, self.action, self.inputs = before
+        for name, value in zip(PREVIOUS, values, strict=True):
+            setattr(self, name, value)
+
 
 for _quantity in KEPT:
     _property = _column_property(_quantity.attribute, _OF_COLUMN[_quantity.shape])
