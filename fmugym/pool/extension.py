@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from types import CodeType
-from typing import Final, ParamSpec, TypeVar
 
 from fmugym.errors import ConfigError
 
 __all__ = [
     "has_native_pool",
     "needs_engine",
-    "passes_refusals",
     "require_engine",
     "require_refusal",
 ]
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 
 @functools.cache
@@ -58,31 +51,16 @@ def require_engine(doing: str) -> None:
         raise ConfigError(needs_engine(doing))
 
 
-_passed: Final[set[CodeType]] = set()
-"""The code of the functions from ``passes_refusals``."""
-
-
-def passes_refusals(function: Callable[P, R]) -> Callable[P, R]:
-    """Mark a function that may be called again if the C code, which it calls, refuses arguments.
-
-    It must change nothing before that. ``require_refusal`` then lets it pass.
-    """
-    _passed.add(function.__code__)
-    return function
-
-
 def require_refusal(error: Exception) -> None:
     """Raise an error again unless the C code has refused the arguments of a call.
 
     A refused call may be repeated with other arguments. Errors of the receiver of messages and of
     signal handlers come after the work was done. They have passed Python functions; those of the C
-    code have not, or only those from ``passes_refusals``.
+    code have not.
 
     Args:
         error: What a call of the C code has raised, in the function that made the call.
     """
     trace = error.__traceback__
-    while trace is not None and trace.tb_next is not None:
-        trace = trace.tb_next
-        if trace.tb_frame.f_code not in _passed:
-            raise error
+    if trace is not None and trace.tb_next is not None:
+        raise error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from traceback import walk_tb
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -78,18 +78,17 @@ class ArrayEngine(BatchEngine):
 
     def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
         """See ``BatchEngine._play_step``."""
-        taken, step = self._take_actions(actions, resetting), self._play.step
-        if step is None:
-            return self._step_pool(taken, resetting)
+        taken, step = self._checked(actions, resetting), cast(Any, self._play.step)
         self.has_moved = True
-        return step(taken, False)
+        played: Played = step(taken, False)
+        return played
 
-    def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
-        """See ``BatchEngine._take_actions``; the hook makes the inputs.
+    def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
+        """See ``BatchEngine._checked``; the hook makes the inputs.
 
         If the hook fails, nothing has changed.
         """
-        taken = np.array(super()._take_actions(actions, idle))  # of which a hook may keep a part
+        taken = np.array(super()._checked(actions, idle))  # of which a hook may keep a part
         read = self.env._episode
         before, read.action = read.keep(), environments_last(taken)
         try:

@@ -21,7 +21,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.extension import passes_refusals, require_refusal
+from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
 from fmugym.task import judging
@@ -80,10 +80,9 @@ class BatchEngine(Engine):
     def __init__(
         self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TaskPrograms
     ) -> None:
-        super().__init__(num_envs)
+        super().__init__(env._instance.pool)
         self.env = env
         self._n = num_envs
-        self._pool = env._instance.pool
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.step_limit, max_episode_steps or sys.maxsize)
         self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
@@ -460,33 +459,36 @@ class BatchEngine(Engine):
     def step(
         self, actions: Any, resetting: MaskArray | None, resting: MaskArray | None = None
     ) -> StepResult:
-        """See ``Engine.step``."""
-        if resting is not None:
-            return self._step_around(actions, resting)
-        if self.offsets is not None or (resetting is not None and not self._pool_starts):
-            taken = self._take_actions(actions, resetting)
-            return self._completed(self._step_pool(taken, resetting), resetting)
+        """See ``Engine.step``; a native pool does the same in one call where it can."""
+        is_usual = resting is None and self.offsets is None
+        can_start = resetting is None or self._pool_starts
+        if self._play.step is None or not (is_usual and can_start):
+            return super().step(actions, resetting, resting)
         return self._completed(self._play_step(actions, resetting), resetting)
 
     def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
-        """Let the pool do the whole step, if it can."""
+        """Let the pool do the whole step."""
         at_ends = self.starts_at_ends and self._starts_at_ends
-        step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
-        if step is None:
-            return self._step_pool(self._take_actions(actions, resetting), resetting)
+        play: Any = self._play
+        step = play.step if resetting is None and not at_ends else play.start_and_step
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            return step(actions, at_ends)
+            played: Played = step(actions, at_ends)
+            return played
         except _REFUSALS as error:
             return self._play_step(self._converted(actions, error), resetting)
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
-        """The actions as the pool takes them, before anything is drawn or stepped.
+        """See ``Engine._take_actions``; what does not step counts as just started."""
+        taken = self._checked(actions, idle)
+        self.has_moved = True
+        if idle is not None:
+            self.ended[:] = idle
+        self._play.before(taken)
+        return taken
 
-        Args:
-            actions: Of all environments.
-            idle: Which environments will not step, shape (N,); None if all will.
-        """
+    def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, before anything is drawn or stepped."""
         self.has_moved = False
         try:
             self._play.check(actions)
@@ -496,39 +498,18 @@ class BatchEngine(Engine):
         taken: npt.NDArray[Any] = actions
         return taken
 
-    def _step_around(self, actions: Any, resting: MaskArray) -> StepResult:
-        """Step the environments that do not rest; what is not stepped counts as just started."""
-        play, taken = self._play, self._take_actions(actions, resting)
-        self.has_moved = True
-        self.ended[:] = resting
-        play.before(taken)
-        self._pool.step(None, resting)
-        self._pool.statuses[resting] = 0  # a fault was told when it came
-        self.add_offsets(self._pool, resting)
-        result = self._completed(play.after(taken), resting)
-        self.ended |= resting
-        self.any_ended = True
-        return result
-
-    @passes_refusals
-    def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
-        """Start the episodes in the mask, and let the FMUs of the other environments step."""
-        play, draws = self._play, self.env.episode_start
-        self.has_moved = True
-        if starting is None:
-            play.before(actions)
-            self._pool.step()
-            self.add_offsets(self._pool)
-            return play.after(actions)
-        indices = starting.nonzero()[0]
+    def _start(self, mask: MaskArray) -> dict[str, Any]:
+        """See ``Engine._start``."""
+        draws, indices = self.env.episode_start, np.flatnonzero(mask)
         drawn = self._streams.draw(draws, indices)
-        play.before(actions)
         self._begin(indices, draws, drawn)
-        self._pool.step(None, starting)
-        self.add_offsets(self._pool, starting)
-        result, troubled, any_ended, _ = play.after(actions)
-        result.infos.update(drawn_info(draws, drawn, starting))
-        return result, troubled, any_ended, starting
+        return drawn_info(draws, drawn, mask)
+
+    def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
+        """See ``Engine._conclude``."""
+        result, troubled, any_ended, _ = self._play.after(taken)
+        result.infos.update(started or {})
+        return self._completed((result, troubled, any_ended, idle), idle)
 
     def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
         """The actions in the form that the pool takes, if it has refused another one."""

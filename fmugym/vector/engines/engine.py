@@ -68,24 +68,26 @@ class Engine(ABC):
 
     way: str
 
-    def __init__(self, num_envs: int) -> None:
-        self.ended = np.zeros(num_envs, np.bool_)
+    _observed: npt.NDArray[np.float32] | None = None
+    """The observations that the pool writes in its step; None for none."""
+
+    def __init__(self, pool: Pool) -> None:
+        self._pool, self.ended = pool, np.zeros(pool.num_instances, np.bool_)
         self.any_ended = False
         self.has_moved = False
         self.offsets: FloatArray | None = None
         self.starts_at_ends = False
 
-    def add_offsets(self, pool: Pool, idle: MaskArray | None = None) -> None:
+    def _add_offsets(self, idle: MaskArray | None = None) -> None:
         """Add the offsets to the outputs of the instances that have stepped.
 
         Args:
-            pool: Has the outputs.
             idle: Which instances have not stepped, shape (N,); None if all have.
         """
         if self.offsets is not None:
-            failed = failed_in(pool.statuses)
+            failed = failed_in(self._pool.statuses)
             left_out = failed if idle is None else failed | idle
-            pool.outputs += np.where(left_out, 0.0, self.offsets[:, np.newaxis])
+            self._pool.outputs += np.where(left_out, 0.0, self.offsets[:, np.newaxis])
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""
@@ -120,17 +122,55 @@ class Engine(ABC):
         """
         return None
 
-    @abstractmethod
     def step(
         self, actions: Any, resetting: MaskArray | None, resting: MaskArray | None = None
     ) -> StepResult:
-        """Step the environments.
+        """Step the environments, in the order that all engines share.
 
         Args:
             actions: Of all environments.
             resetting: Which ones start an episode instead; None for none.
             resting: Which ones stay as they are, with a reward of 0; their episodes count as
                 ended. None for none; at most one of both masks is given.
+        """
+        idle = resetting if resting is None else resting
+        taken = self._take_actions(actions, idle)
+        self.has_moved = True
+        started = None if resetting is None else self._start(resetting)
+        self._pool.step(None, idle, self._observed)
+        if resting is not None:
+            self._pool.statuses[resting] = 0  # a fault was told when it came
+        self._add_offsets(idle)
+        result = self._conclude(taken, idle, started)
+        if resting is not None:
+            self.ended |= resting
+            self.any_ended = True
+        return result
+
+    @abstractmethod
+    def _take_actions(self, actions: Any, idle: MaskArray | None) -> Any:
+        """Check the actions, and write the inputs of the FMUs. If one is refused, nothing moves.
+
+        Args:
+            actions: Of all environments.
+            idle: Which environments will not step, shape (N,); None if all will.
+
+        Returns:
+            What ``_conclude`` needs of them.
+        """
+
+    @abstractmethod
+    def _start(self, mask: MaskArray) -> Any:
+        """Start episodes in the middle of a step; returns what ``_conclude`` tells of them."""
+
+    @abstractmethod
+    def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
+        """Make the result of a step of the FMUs.
+
+        Args:
+            taken: What ``_take_actions`` has returned.
+            idle: Which environments have not stepped, shape (N,); None if all have.
+            started: What ``_start`` has returned; None if no episode has started.
         """
 
     @abstractmethod

@@ -6,8 +6,6 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import compress
-from operator import not_
 from types import MappingProxyType
 from typing import Any, cast
 
@@ -56,8 +54,8 @@ class PerEnvEngine(Engine):
         max_episode_steps: int | None,
         action_space: Any,
     ) -> None:
-        super().__init__(len(envs))
-        self._envs, self._pool = envs, pool
+        super().__init__(pool)
+        self._envs, self._observed = envs, pool.observations
         self._columns = [PoolColumn(pool, index) for index in range(len(envs))]
         for env, column in zip(envs, self._columns, strict=True):
             env._use(column)
@@ -139,54 +137,55 @@ class PerEnvEngine(Engine):
     ) -> StepResult:
         """See ``Engine.step``."""
         self.has_moved = False
-        items, idle = self._actions(actions), resetting if resting is None else resting
-        idles = [False] * len(items) if idle is None else idle.tolist()
         try:
-            self._take_actions(items, [*compress(range(len(items)), map(not_, idles))])
-            self._pool.step(None, idle, self._pool.observations)
-            if self.offsets is not None:
-                self.add_offsets(self._pool, idle)
-                observed = self._pool.observations
-                observed[:] = self._pool.outputs[: observed.shape[1]].T
-            self.has_moved = True
-            result = self._result(self._results(idles, starts=resting is None))
+            return super().step(actions, resetting, resting)
         except BaseException:
             for env in self._envs:
                 if self.has_moved:  # its FMU has stepped without a result
                     env._ended = True
             raise
-        if resting is not None:
-            result.truncated[resting] = False
-            self.ended |= resting
-            self.any_ended = True
-        return result
 
-    def _results(self, idle: Sequence[bool], *, starts: bool) -> list[Result]:
-        """Let the environments conclude the step one after another, start an episode, or rest."""
+    def _add_offsets(self, idle: MaskArray | None = None) -> None:
+        """See ``Engine._add_offsets``; the pool has made observations of what was before them."""
+        super()._add_offsets(idle)
+        if self.offsets is not None:
+            observed = self._pool.observations
+            observed[:] = self._pool.outputs[: observed.shape[1]].T
+
+    def _start(self, mask: MaskArray) -> dict[int, dict[str, Any]]:
+        """See ``Engine._start``; returns the infos by the number of the environment."""
+        infos = {}
+        for index in np.flatnonzero(mask).tolist():
+            observation, infos[index] = self._reset(index, None, {})
+            self._observations[index] = _copied(observation)
+        return infos
+
+    def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
+        """See ``Engine._conclude``; the environments conclude the step one after another."""
         results: list[Result] = []
         statuses, columns = self._pool.statuses.tolist(), self._pool.outputs.T.tolist()
+        idles, infos = [False] * len(columns) if idle is None else idle.tolist(), started or {}
         index = 0
         try:
-            for index, (env, is_idle) in enumerate(zip(self._envs, idle, strict=True)):
-                if is_idle and not starts:
-                    result: Result = self._observations[index], 0.0, False, False, {}
-                elif is_idle:
-                    observation, info = self._reset(index, None, {})
-                    result = observation, 0.0, False, False, info
-                else:
-                    result = _concluded(env, statuses[index], tuple(columns[index]))
+            for index, (env, is_idle) in enumerate(zip(self._envs, idles, strict=True)):
+                if is_idle:
+                    observation = self._observations[index]
+                    results.append((observation, 0.0, False, False, infos.get(index, {})))
+                    continue
+                result = _concluded(env, statuses[index], tuple(columns[index]))
                 is_new = env._conversions.pool_observes
                 self._observations[index] = result[0] if is_new else _copied(result[0])
                 results.append(result)
         except FMUGymError as error:
             raise _located(error, index) from error
-        return results
+        return self._result(results, idle)
 
-    def _result(self, results: Sequence[Result]) -> StepResult:
+    def _result(self, results: Sequence[Result], idle: MaskArray | None) -> StepResult:
         _, rewards, terminated, cut_off, infos = zip(*results, strict=True)
         truncated = np.array(cut_off, np.bool_)
         counts = [env._episode.step_count for env in self._envs]
         truncated |= np.array(counts) >= self._limit
+        truncated &= True if idle is None else ~idle
         result = StepResult(
             self._joined(),
             np.array(rewards, np.float64),
@@ -224,8 +223,10 @@ class PerEnvEngine(Engine):
         except FMUGymError as error:
             raise _located(error, index) from error
 
-    def _take_actions(self, actions: Sequence[Any], running: Sequence[int]) -> None:
-        """Let environments make their inputs; if an action cannot be used, none has taken any."""
+    def _take_actions(self, actions: Any, idle: MaskArray | None) -> None:
+        """See ``Engine._take_actions``; if an action cannot be used, none has taken any."""
+        actions, idles = self._actions(actions), np.zeros(len(self._envs)) if idle is None else idle
+        running = np.flatnonzero(np.logical_not(idles)).tolist()
         befores: list[tuple[FMUEnv, Any]] = []
         given, index = self._pool.inputs.copy(), 0
         try:
