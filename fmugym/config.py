@@ -40,11 +40,11 @@ from fmugym.keys import (
     Listed,
     Table,
     check_fields,
-    checked,
+    checked_entry,
     key,
     option,
     or_none,
-    table_of,
+    table_of_fields,
 )
 from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
@@ -177,7 +177,7 @@ _REMEMBERED: Final = Table(
     what="key of 'memory'",
 )
 
-NAMES: Final = Kind(
+_NAMES: Final = Kind(
     _names, {"title": "name, list of names", "type": ["string", "array"], "items": TEXT.schema}
 )
 NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number", "minimum": 0})
@@ -229,13 +229,13 @@ class Foreign(KnownArguments):
         0.0,
     )
     preload: tuple[str, ...] = key(
-        Kind(_names, NAMES.schema, "libraries"),
+        Kind(_names, _NAMES.schema, "libraries"),
         "Shared libraries that are [loaded before](foreign-fmus.md#missing-libraries) "
         "the FMU's own. A relative path is relative to the file of the class or of the task.",
         (),
     )
     archive_limits: ArchiveLimits | None = key(
-        table_of(ArchiveLimits, what="archive limit", make=ArchiveLimits),
+        table_of_fields(ArchiveLimits, what="archive limit", make=ArchiveLimits),
         "The [largest FMU](reliability.md#archive-limits) that is opened, as a dict or a "
         "`fmugym.archive.ArchiveLimits`.",
         None,
@@ -246,7 +246,7 @@ class Foreign(KnownArguments):
         check_fields(self)
 
 
-FOREIGN: Final = table_of(Foreign, what="key of 'foreign'", make=Foreign)
+FOREIGN: Final = table_of_fields(Foreign, what="key of 'foreign'", make=Foreign)
 """The keys of ``Foreign``."""
 
 
@@ -262,11 +262,13 @@ class EnvConfig:
     """
 
     model_input_names: tuple[str, ...] = key(
-        NAMES,
+        _NAMES,
         "Variables to which the action is written: inputs or tunable parameters. "
         "[Arrays](fmi.md#arrays) go by their name, or by elements as `v[3]`.",
     )
-    model_output_names: tuple[str, ...] = key(NAMES, "Variables that `state` holds, in this order.")
+    model_output_names: tuple[str, ...] = key(
+        _NAMES, "Variables that `state` holds, in this order."
+    )
     model_parameters: Mapping[str, Any] = key(
         Entries(Kind(as_distribution)),
         "Start values and parameters by name: numbers or [distributions](config.md#distributions). "
@@ -309,7 +311,7 @@ class EnvConfig:
         0.0,
     )
     monitor_names: tuple[str, ...] = key(
-        NAMES,
+        _NAMES,
         "Variables that are read along with the outputs: in `out`, not in `state`.",
         (),
     )
@@ -447,7 +449,7 @@ class EnvConfig:
         for name in ("positive_reward", "negative_reward"):
             if name in given and given.get("reward") is not None:
                 raise ConfigError(f"config keys 'reward' and {name!r} contradict each other")
-        return cls(**checked(CONFIG, given))
+        return cls(**checked_entry(CONFIG, given))
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -517,7 +519,7 @@ class EnvConfig:
             )
 
 
-CONFIG: Final = table_of(
+CONFIG: Final = table_of_fields(
     EnvConfig,
     what="config key",
     elsewhere={

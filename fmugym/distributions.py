@@ -31,8 +31,8 @@ from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
     "Choice",
-    "Column",
     "Distribution",
+    "DrawnColumn",
     "LogUniform",
     "Normal",
     "Recipe",
@@ -222,7 +222,7 @@ class Choice(KnownArguments):
 
 
 @dataclass(frozen=True)
-class Column(Choice):
+class DrawnColumn(Choice):
     """A column of a table of which each episode draws one row, for all of the table's columns.
 
     By itself it is a ``Choice``.
@@ -280,7 +280,7 @@ class Truncated:
 _KINDS: Final[Mapping[str, type[Any]]] = {
     kind.distribution: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
-_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), Column)
+_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), DrawnColumn)
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _LEAST_SHARE: Final = 0.01
 """Of the draws that must lie within limits, so that there are few redraws."""
@@ -388,7 +388,7 @@ def draw_all(distributions: Iterable[Any], rng: np.random.Generator) -> list[Any
     places: dict[str, int] = {}
     values = []
     for one in distributions:
-        if type(one) is not Column:
+        if type(one) is not DrawnColumn:
             values.append(draw(one, rng))
             continue
         if one.table not in places:
@@ -409,7 +409,7 @@ def together(distributions: Sequence[Any], recipes: Sequence[Recipe]) -> list[Re
     """
     found, tables, before = list(recipes), set[str](), ""
     for place, one in enumerate(distributions):
-        table = one.table if type(one) is Column else ""
+        table = one.table if type(one) is DrawnColumn else ""
         if table and table == before:
             found[place] = found[place]._replace(kind="same_row")
         elif table in tables:

@@ -44,7 +44,7 @@ __all__ = [
     "nearest_name",
     "plain",
     "printable",
-    "reading",
+    "reading_file",
     "reason",
     "shown",
     "unknown_argument",
@@ -180,7 +180,7 @@ def reason(error: Exception) -> str:
 
 
 @contextmanager
-def reading(failure: str) -> Iterator[None]:
+def reading_file(failure: str) -> Iterator[None]:
     """While a file is read, make a ``ConfigError`` of whatever a damaged one raises.
 
     Args:

@@ -1,6 +1,6 @@
 """Keys of configs, task files and systems, each of which is declared once.
 
-Kinds and tables are data. ``checked`` and ``with_paths`` read them, and so does
+Kinds and tables are data. ``checked_entry`` and ``with_paths`` read them, and so does
 ``docs/_site/keys.py``, which writes the tables of the documents and the JSON Schema for editors.
 """
 
@@ -40,16 +40,16 @@ __all__ = [
     "Mistake",
     "Table",
     "check_fields",
-    "checked",
+    "checked_entry",
     "found_mistakes",
     "key",
     "option",
     "or_none",
-    "table_of",
+    "table_of_fields",
     "with_paths",
 ]
 
-Keys = tuple[str, ...]
+_Keys = tuple[str, ...]
 
 REQUIRED: Final = object()
 """The default of a key that must be given."""
@@ -157,12 +157,12 @@ class Mistake(NamedTuple):
         is_unknown: Whether there is no such key.
     """
 
-    keys: Keys
+    keys: _Keys
     text: str
     is_unknown: bool = False
 
 
-def checked(kind: AnyKind, value: Any) -> Any:
+def checked_entry(kind: AnyKind, value: Any) -> Any:
     """Check a value in Python.
 
     Returns:
@@ -185,8 +185,8 @@ def found_mistakes(kind: AnyKind, value: Any) -> tuple[Any, list[Mistake]]:
         value: As the user gave it.
 
     Returns:
-        The value as in ``checked``, as far as it is right, and the mistakes. A key of a table whose
-        value is wrong is not in it.
+        The value as in ``checked_entry``, as far as it is right, and the mistakes. A key of a table
+        whose value is wrong is not in it.
     """
     reading = _Reading([])
     return reading.read(kind, (), value), reading.mistakes
@@ -197,7 +197,7 @@ class _Reading(NamedTuple):
 
     mistakes: list[Mistake]
 
-    def read(self, kind: AnyKind, keys: Keys, value: Any) -> Any:
+    def read(self, kind: AnyKind, keys: _Keys, value: Any) -> Any:
         """The value as the package uses it; None if it is wrong."""
         match kind:
             case Kind():
@@ -224,13 +224,13 @@ class _Reading(NamedTuple):
                 }
         return self._table(kind, keys, value)
 
-    def _note(self, keys: Keys, text: object, is_unknown: bool = False) -> None:
+    def _note(self, keys: _Keys, text: object, is_unknown: bool = False) -> None:
         self.mistakes.append(Mistake(keys, str(text), is_unknown))
 
-    def _too_many(self, keys: Keys, most: int, given: Sized) -> None:
+    def _too_many(self, keys: _Keys, most: int, given: Sized) -> None:
         self._note(keys, f"{keys[-1]} has at most {most} names, got {len(given)}")
 
-    def _items(self, keys: Keys, value: Any) -> dict[str, Any] | None:
+    def _items(self, keys: _Keys, value: Any) -> dict[str, Any] | None:
         what = keys[-1] if keys else "a task"
         try:
             return check_mapping(what, value)
@@ -239,7 +239,7 @@ class _Reading(NamedTuple):
                 keys, f"{what} must be a table with names as keys (a dict), got {shown(value)}"
             )
 
-    def _table(self, table: Table, keys: Keys, value: Any) -> Any:
+    def _table(self, table: Table, keys: _Keys, value: Any) -> Any:
         if table.make is not None and isinstance(value, table.make):
             return value
         before = len(self.mistakes)
@@ -263,7 +263,7 @@ class _Reading(NamedTuple):
         right = {n: one for n, one in given.items() if one is not None or items[n] is None}
         return defaults | right
 
-    def _value(self, table: Table, name: str, keys: Keys, value: Any) -> Any:
+    def _value(self, table: Table, name: str, keys: _Keys, value: Any) -> Any:
         if name in table.keys:
             one = table.keys[name]
             is_unset = value is None and one.default is None
@@ -272,7 +272,7 @@ class _Reading(NamedTuple):
             return self._note(keys, f"{name!r} is no {table.what}{table.elsewhere[name]}", True)
         return self._note(keys, unknown_name(table.what, name, table.keys), True)
 
-    def _require(self, table: Table, keys: Keys, given: Mapping[str, Any]) -> None:
+    def _require(self, table: Table, keys: _Keys, given: Mapping[str, Any]) -> None:
         for name, one in table.keys.items():
             if one.default is REQUIRED and name not in given:
                 self._note(keys, f"the {table.what} {name!r} is missing")
@@ -330,7 +330,7 @@ def key(kind: AnyKind, text: str, default: Any = REQUIRED, shown: str = "") -> A
     return field(default=default, metadata=declared)
 
 
-def table_of(cls: Any, **options: Any) -> Table:
+def table_of_fields(cls: Any, **options: Any) -> Table:
     """Make the table of the keys of a dataclass.
 
     Args:
@@ -346,7 +346,7 @@ def check_fields(made: Any) -> None:
     Raises:
         ConfigError: For values that are wrong; it names all of them.
     """
-    for name, value in checked(table_of(type(made)), vars(made)).items():
+    for name, value in checked_entry(table_of_fields(type(made)), vars(made)).items():
         object.__setattr__(made, name, value)
 
 

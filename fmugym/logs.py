@@ -32,14 +32,14 @@ from fmugym.checks import Spellings, by_own_names, check_number, normal_form
 from fmugym.declared import Task
 from fmugym.declared.data_files import read_tables
 from fmugym.declared.data_rows import usual_distance
-from fmugym.declared.data_tables import Column, Table
-from fmugym.declared.dates import CURE, HOUR, YEAR, zone_of
+from fmugym.declared.data_tables import DataColumn, DataTable
+from fmugym.declared.dates import HOUR, LOCAL_TIME_ADVICE, YEAR, zone_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.series import read_data
 from fmugym.declared.standard_time import standard_time
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, reading, shown, unknown_name
+from fmugym.errors import ConfigError, reading_file, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray
 from fmugym.recording import Recorder, Recording
@@ -124,7 +124,7 @@ class PlantLog:
         """
         zone = None if timezone is None else zone_of("timezone", timezone)
         columns, units = _columns(path)
-        time = Table([*columns.values()]).find_time()
+        time = DataTable([*columns.values()]).find_time()
         if time is None or units.pop(time.name, "s") != "s":
             raise ConfigError(f"{shown(str(path))} has no column 'time' of seconds or dates")
         del columns[time.name]
@@ -193,11 +193,11 @@ def _heading(text: str) -> tuple[str, str | None]:
     return match["name"], unit
 
 
-def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, Column], dict[str, str]]:
+def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, DataColumn], dict[str, str]]:
     """The columns of a log by name, and their units."""
-    with reading(f"{shown(str(path))} cannot be read"):
+    with reading_file(f"{shown(str(path))} cannot be read"):
         (table,) = read_tables(Path(path)).values()
-    columns: dict[str, Column] = {}
+    columns: dict[str, DataColumn] = {}
     units: dict[str, str] = {}
     numbers: dict[str, int] = {}
     for number, column in enumerate(table.columns, 1):
@@ -216,7 +216,7 @@ def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, Column], dict[str,
 
 
 def _times(
-    time: Column, zone: datetime.tzinfo | None, standard: int | None
+    time: DataColumn, zone: datetime.tzinfo | None, standard: int | None
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """The times in seconds, without those of 29 February, and which rows they are of."""
     if time.is_numeric:
@@ -229,7 +229,7 @@ def _times(
         row = int(back[0])
         raise ConfigError(
             f"the times must rise, but in {time.table} {time.when(row + 1)} is not above "
-            f"{time.when(row)}. {CURE}"
+            f"{time.when(row)}. {LOCAL_TIME_ADVICE}"
         )
     is_known = ~np.isnan(seconds)
     return seconds[is_known], is_known
@@ -244,7 +244,7 @@ def _episodes(times: FloatArray, is_known: npt.NDArray[np.bool_]) -> FloatArray:
 
 
 def _require_rising(
-    time: Column, rows: npt.NDArray[Any], times: FloatArray, episodes: FloatArray
+    time: DataColumn, rows: npt.NDArray[Any], times: FloatArray, episodes: FloatArray
 ) -> None:
     wrong = (~(np.diff(times) > 0.0)) & (np.diff(episodes) == 0)
     if not np.isfinite(times).all():

@@ -15,7 +15,7 @@ from test_identification import TRUE, swing
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.distributions import Column, Normal, draw_all
+from fmugym.distributions import DrawnColumn, Normal, draw_all
 from fmugym.fit import fit_logs, write_rows
 from fmugym.logs import PlantLog
 
@@ -297,7 +297,10 @@ class TestFitted:
         assert again["c"] == values["c"]
 
     def test_columns_that_are_apart_still_belong_together(self):
-        left, right = Column([1.0, 2.0, 3.0], table="t"), Column([10.0, 20.0, 30.0], table="t")
+        left, right = (
+            DrawnColumn([1.0, 2.0, 3.0], table="t"),
+            DrawnColumn([10.0, 20.0, 30.0], table="t"),
+        )
         rng = np.random.default_rng(0)
         for _ in range(20):
             first, _, second = draw_all([left, Normal(0.0, 1.0), right], rng)

@@ -11,9 +11,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.processors import available_processors
 from fmugym.vector import FMUVectorEnv

@@ -9,9 +9,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.pool.base import FloatArray
+
 __all__ = ["CMA", "MOST_CORRELATED"]
 
-FloatArray = npt.NDArray[np.float64]
 
 MOST_CORRELATED: Final = 200
 """More numbers than these are searched without covariances."""

@@ -16,10 +16,10 @@ from fmugym.baselines.measuring import Formula, formula_of, of_columns
 from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.expressions.value import Value, where
+from fmugym.pool.base import FloatArray
 
 __all__ = [
     "Controller",
-    "FloatArray",
     "Numbers",
     "Signal",
     "attribute_of",
@@ -29,7 +29,6 @@ __all__ = [
     "require_physical",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
 Numbers = float | FloatArray
 """A number, or an array of shape (N,) with one for each environment."""

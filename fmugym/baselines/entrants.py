@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import Arena, Merit
-from fmugym.baselines.controller import FloatArray
+from fmugym.pool.base import FloatArray
 
 __all__ = ["NO_MERIT", "Entrant"]
 

@@ -9,21 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.baselines.controller import (
-    Controller,
-    FloatArray,
-    Numbers,
-    Signal,
-    check_numbers,
-    either,
-    limited,
-)
+from fmugym.baselines.controller import Controller, Numbers, Signal, check_numbers, either, limited
 from fmugym.baselines.law import Decided, Law
 from fmugym.errors import ConfigError
 from fmugym.expressions.value import Value
 from fmugym.extras import imported
 from fmugym.linearization import LinearModel
 from fmugym.linearization.trajectories import discrete
+from fmugym.pool.base import FloatArray
 
 __all__ = ["LQR", "PID", "Hysteresis"]
 

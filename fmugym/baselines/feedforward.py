@@ -8,10 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, FloatArray, either
+from fmugym.baselines.controller import Controller, either
 from fmugym.baselines.law import Decided, Law
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Constant", "Random", "Schedule"]
 

@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.controller import Controller, FloatArray, Numbers
+from fmugym.baselines.controller import Controller, Numbers
 from fmugym.expressions.value import Value
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Decided", "Law"]
 

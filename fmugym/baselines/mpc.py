@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.controller import Controller, FloatArray, attribute_of
+from fmugym.baselines.controller import Controller, attribute_of
 from fmugym.baselines.observer import COPIES, CORRECTION, Observer, spread
 from fmugym.checks import (
     LARGEST_COUNT,
@@ -29,6 +29,7 @@ from fmugym.checks import (
 )
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 from fmugym.task.future import Future
 from fmugym.task.snapshot import Snapshot, scope_of
 from fmugym.vector import FMUVectorEnv

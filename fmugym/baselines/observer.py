@@ -7,9 +7,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.controller import FloatArray
-from fmugym.distributions import Column, is_distribution
+from fmugym.distributions import DrawnColumn, is_distribution
 from fmugym.env import FMUEnv
+from fmugym.pool.base import FloatArray
 
 __all__ = ["COPIES", "CORRECTION", "Observer", "spread"]
 
@@ -82,7 +82,7 @@ def spread(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
     others = np.delete(np.arange(COPIES), COPIES // 2)
     tables: dict[str, dict[str, FloatArray]] = {}
     for name, value in env.config.model_parameters.items():
-        if type(value) is Column:
+        if type(value) is DrawnColumn:
             tables.setdefault(value.table, {})[name] = np.array(value.values, np.float64)
         elif is_distribution(value):
             drawn = [value.sample(rng) for _ in range(_SAMPLES)]

@@ -14,7 +14,7 @@ from typing import Any, Final, TypeGuard
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
 from fmugym.baselines.mpc import MPC
@@ -30,6 +30,7 @@ from fmugym.baselines.table_texts import (
 from fmugym.checks import check_text
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.pool.base import FloatArray
 
 __all__ = [
     "Search",

@@ -11,11 +11,12 @@ import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.entrants import Entrant
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Tuning", "entrant_of", "numbers_at", "tune"]
 

@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.checks import Spellings, check_integer, normal_form
-from fmugym.declared.dates import Dates, FloatArray, IntArray, shown_date, zone_of
+from fmugym.declared.dates import Dates, IntArray, shown_date, zone_of
 from fmugym.errors import ConfigError, first_of, shown, unknown_name
+from fmugym.pool.base import FloatArray
 
-__all__ = ["Column", "Table"]
+__all__ = ["DataColumn", "DataTable"]
 
 Cells = Sequence[Any] | npt.NDArray[Any]
 """The cells of a column: texts of a CSV file, numbers, or timestamps."""
@@ -29,7 +30,7 @@ _BLANKS: Final = " \t\r\n"
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
+class DataColumn:
     """A column of a table.
 
     Attributes:
@@ -181,7 +182,7 @@ def _is_number(cell: Any) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class DataTable:
     """The columns of a file.
 
     Attributes:
@@ -193,7 +194,7 @@ class Table:
         offset: That of its times, in seconds east of UTC, if its header tells it.
     """
 
-    columns: Sequence[Column]
+    columns: Sequence[DataColumn]
     separator: str = ""
     period: float | None = None
     means: Mapping[str, float] = field(default_factory=dict)
@@ -205,7 +206,7 @@ class Table:
         """The names of the columns."""
         return [column.name for column in self.columns]
 
-    def find(self, key: str | int) -> Column:
+    def find(self, key: str | int) -> DataColumn:
         """Find a column by its name, or by its number from 1 on.
 
         Raises:
@@ -224,7 +225,7 @@ class Table:
             raise unknown_name("column", key, self.names)
         return self.columns[numbers[0] - 1]
 
-    def find_time(self) -> Column | None:
+    def find_time(self) -> DataColumn | None:
         """Find the column of times by its usual names; None if there is none.
 
         Raises:

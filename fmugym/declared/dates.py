@@ -18,15 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.pool.base import FloatArray
 
 __all__ = [
-    "CURE",
     "DAY",
     "HOUR",
+    "LOCAL_TIME_ADVICE",
     "REGULAR",
     "YEAR",
     "Dates",
-    "FloatArray",
     "IntArray",
     "moment_of_year",
     "offset_text",
@@ -35,7 +35,6 @@ __all__ = [
     "zone_of",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 REGULAR: Final = 0.9
@@ -63,7 +62,7 @@ _MONTHS_OF_SPRING: Final = (3, 4, 9, 10, 11)
 Told = Callable[[int], str]
 """Says where the row with an index stands."""
 
-CURE: Final = (
+LOCAL_TIME_ADVICE: Final = (
     "If these are local times with daylight saving time, say of which zone: "
     'timezone = "Europe/Berlin"; if they are not, the offset: timezone = "+01:00"'
 )
@@ -260,7 +259,7 @@ class Dates:
             if is_spring and missing.hour < 4:
                 raise ConfigError(
                     f"{told(int(place) + 1)}: {shown_date(self.walls[place + 1])} follows "
-                    f"{shown_date(self.walls[place])}, an hour is missing. {CURE}"
+                    f"{shown_date(self.walls[place])}, an hour is missing. {LOCAL_TIME_ADVICE}"
                 )
 
 

@@ -32,7 +32,7 @@ from fmugym.declared.series import read_data
 from fmugym.declared.setpoints import SetPoints
 from fmugym.declared.spelling import as_declared
 from fmugym.declared.standard_time import standard_time
-from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, start_value
+from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, declared_start
 from fmugym.declared.warming import read_warm_up
 from fmugym.errors import ConfigError
 from fmugym.expressions.language import CONSTANTS, Expression
@@ -313,13 +313,13 @@ class Declarations:
             for name, column in read_fitted(entry).items():
                 variable = self.variables.find(entry, aliases.get(name, name), "variable")
                 in_its_unit = replace(variable, conversion=IDENTITY)
-                value = start_value(in_its_unit, replace(entry, value=column))
+                value = declared_start(in_its_unit, replace(entry, value=column))
                 fitted[variable.alias] = variable, value
         return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
     def _parameter(self, entry: Entry) -> tuple[TaskVariable, Any]:
         variable = self.variables.find(entry, entry.name, "variable")
-        return variable, start_value(variable, entry)
+        return variable, declared_start(variable, entry)
 
     def _read_actions(self) -> list[TaskVariable]:
         actions: list[TaskVariable] = []

@@ -12,7 +12,7 @@ from fmugym.distributions import Choice
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
     from fmugym.declared.entries import Entry
-    from fmugym.declared.parts import Memory
+    from fmugym.declared.parts import MemoryVariable
     from fmugym.declared.variables import TaskVariable
     from fmugym.expressions.value import Value
 
@@ -56,7 +56,7 @@ def check_controller(entry: Entry, variable: TaskVariable, controller: Controlle
 
 
 def check_written(
-    entry: Entry, variable: TaskVariable, value: Value, memory: Mapping[str, Memory]
+    entry: Entry, variable: TaskVariable, value: Value, memory: Mapping[str, MemoryVariable]
 ) -> None:
     """Check what an expression writes to an Enumeration, as far as that is known.
 
@@ -79,7 +79,7 @@ def _require_items(entry: Entry, variable: Variable, values: Iterable[float]) ->
             checked_value(variable, value)
 
 
-def _known(value: Value, memory: Mapping[str, Memory]) -> Iterator[float]:
+def _known(value: Value, memory: Mapping[str, MemoryVariable]) -> Iterator[float]:
     """What a value is at one time or another, as far as that is known."""
     graph, waiting = value.graph, [value.node]
     while waiting:

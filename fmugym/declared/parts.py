@@ -13,7 +13,7 @@ from fmugym.expressions.language import Expression
 __all__ = [
     "Derived",
     "Limits",
-    "Memory",
+    "MemoryVariable",
     "Term",
     "read_derived",
     "read_limits",
@@ -42,7 +42,7 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Memory:
+class MemoryVariable:
     """A value that the task itself remembers during an episode.
 
     Attributes:
@@ -67,10 +67,10 @@ class Derived:
     limits: Limits
 
 
-def read_memory(entry: Entry) -> Memory:
+def read_memory(entry: Entry) -> MemoryVariable:
     """Read a value that the task remembers."""
     start = entry.required("start").value
-    return Memory(entry, start, entry.value.get("update"), read_limits(entry))
+    return MemoryVariable(entry, start, entry.value.get("update"), read_limits(entry))
 
 
 def read_derived(entry: Entry) -> Derived:

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.variables import TaskVariable
-from fmugym.declared.warming import CLOCK
+from fmugym.declared.warming import WARM_UP_CLOCK
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DeclaredWarmUp"]
 
-Hook = Callable[[Any], Any]
+_Hook = Callable[[Any], Any]
 
 
 def variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
@@ -70,7 +70,7 @@ class Pilot:
             if variable.alias in controllers.acting
         }
         self._names = tuple(controllers.measured())
-        self._is_measured = np.array([name != CLOCK for name in self._names], dtype=bool)
+        self._is_measured = np.array([name != WARM_UP_CLOCK for name in self._names], dtype=bool)
         entry = naming.declared.warm_up.entry.child("controller")
         measured = map(Expression.parse, self._names)
         self.values = [naming.value(entry, one, Moment.SEEN).number for one in measured]
@@ -145,7 +145,7 @@ class DeclaredWarmUp(WarmUp):
         self,
         naming: Naming,
         inputs: Sequence[Value],
-        update: Hook,
+        update: _Hook,
         written: Mapping[str, Sequence[Value]],
         config: Mapping[str, Any],
     ) -> None:

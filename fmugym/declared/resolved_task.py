@@ -42,7 +42,7 @@ from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
-from fmugym.declared.variables import TaskVariable, is_plain
+from fmugym.declared.variables import TaskVariable, has_fmu_values
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of, update_by
@@ -61,7 +61,7 @@ WORST: Final = "worst reward"
 _LONG_AGO: Final = 1e9
 """Steps since an action was switched, at the beginning of an episode."""
 
-Hook = Callable[..., Any]
+_Hook = Callable[..., Any]
 
 
 class ResolvedTask:
@@ -273,8 +273,8 @@ class ResolvedTask:
 
     # Spaces, and what leads into and out of them.
 
-    def _hooks_of_spaces(self) -> dict[str, Hook]:
-        hooks: dict[str, Hook] = {}
+    def _hooks_of_spaces(self) -> dict[str, _Hook]:
+        hooks: dict[str, _Hook] = {}
         actions, seen, formulas = self._action_space(), self._observation_space(), self.formulas
         if formulas.inputs is not None:
             hooks["_get_action_space"] = lambda env: actions
@@ -286,7 +286,7 @@ class ResolvedTask:
         """The action space; None if it is that of the inputs as they are."""
         variables = self._declared.actions
         are_inputs = all(
-            variable.in_fmu is not None and is_plain(variable) for variable in variables
+            variable.in_fmu is not None and has_fmu_values(variable) for variable in variables
         )
         if are_inputs and not self._declared.inputs and not self._declared.rescales:
             return None
@@ -325,7 +325,7 @@ class ResolvedTask:
         check_written(entry, variable, value, self._declared.memory)
         return value
 
-    def _action_masks(self) -> Hook | None:
+    def _action_masks(self) -> _Hook | None:
         naming, values = self._naming, list[Value]()
         for variable in self._declared.actions if self._declared.are_choices else ():
             for level in map(naming.constant, variable.levels):
@@ -344,7 +344,7 @@ class ResolvedTask:
         if (
             self._declared.normalization is None
             and names == self._naming.outputs
-            and all(is_plain(variables[name]) for name in names)
+            and all(has_fmu_values(variables[name]) for name in names)
         ):
             return None
         return _box([seen.limits for seen in self._normalized])
@@ -385,7 +385,7 @@ class ResolvedTask:
             self._info() if has_info else {},
         )
 
-    def _hooks_of_rewards(self) -> dict[str, Hook]:
+    def _hooks_of_rewards(self) -> dict[str, _Hook]:
         rewards = self._declared.rewards
         if not rewards:
             return {}
@@ -457,7 +457,7 @@ class ResolvedTask:
             if memory.update is not None
         }
 
-    def _fault_reward(self) -> Hook:
+    def _fault_reward(self) -> _Hook:
         """A failed step gives the reward that the file says, or no more than any step before."""
         own = self._root.child("config").child("fault_reward")
         if own.value is not None:

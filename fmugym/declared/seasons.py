@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 from fmugym.checks import Spellings
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import chosen_files, file_lists
-from fmugym.distributions import Choice, Column
+from fmugym.distributions import Choice, DrawnColumn
 from fmugym.errors import unknown_name
 
 __all__ = ["Scenario", "held_out_times", "read_begin", "read_scenarios"]
@@ -102,7 +102,7 @@ def read_begin(
         raise entry.error("no day of the season is left for an episode")
     if not named:
         return Choice([start for (start,) in free]), alone
-    begin, *columns = (Column(one, table="beginnings") for one in zip(*free, strict=True))
+    begin, *columns = (DrawnColumn(one, table="beginnings") for one in zip(*free, strict=True))
     drawn = dict(zip(named, columns, strict=True))
     return begin, drawn | {name: one for name, one in alone.items() if name not in named}
 

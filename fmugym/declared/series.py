@@ -10,11 +10,12 @@ from typing import Final
 import numpy as np
 
 from fmugym.declared.data_rows import read_rows
-from fmugym.declared.dates import DAY, YEAR, FloatArray
+from fmugym.declared.dates import DAY, YEAR
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import files_of, variable_of
 from fmugym.declared.parts import Limits, read_limits
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 from fmugym.task.future import Span, distance_of
 
 __all__ = ["Series", "read_data", "read_schedule"]

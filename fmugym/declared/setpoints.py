@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import RAMP, SETPOINT, SINE, STEPS
-from fmugym.declared.parts import Derived, Limits, Memory, read_limits
+from fmugym.declared.parts import Derived, Limits, MemoryVariable, read_limits
 from fmugym.declared.series import Series, read_schedule
 from fmugym.expressions.language import Expression
 
@@ -68,7 +68,7 @@ class SetPoints:
         brought: The names that curves and deviations bring with them.
     """
 
-    memory: dict[str, Memory]
+    memory: dict[str, MemoryVariable]
     series: dict[str, Series]
     derived: dict[str, Derived]
     steps: dict[str, Steps] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class SetPoints:
         match kind:
             case "value":
                 value = entry.required("value").value
-                self.memory[entry.name] = Memory(entry, value, None, read_limits(entry))
+                self.memory[entry.name] = MemoryVariable(entry, value, None, read_limits(entry))
             case "schedule":
                 self.series[entry.name] = read_schedule(entry)
             case "steps":
@@ -114,6 +114,6 @@ class SetPoints:
         names = {key: f"{entry.name}_{key}" for key in numbers}
         self.brought |= set(names.values())
         for key, one in numbers.items():
-            self.memory[names[key]] = Memory(entry, one.value, None, _UNLIMITED)
+            self.memory[names[key]] = MemoryVariable(entry, one.value, None, _UNLIMITED)
         expression = Expression.parse(formula.format(**names))
         self.derived[entry.name] = Derived(entry, expression, read_limits(entry))

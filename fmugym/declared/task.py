@@ -25,7 +25,7 @@ from fmugym.declared.seasons import read_scenarios
 from fmugym.declared.writing import as_toml, revised, write_new
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
-from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
+from fmugym.keys import Entries, Mistake, checked_entry, found_mistakes, with_paths
 
 __all__ = ["Task"]
 
@@ -394,7 +394,7 @@ def _check(source: Source) -> None:
         entry = _root(source).child(name)
         if entry.value is not None:
             with entry.placing():
-                checked(Entries(TASK.keys[name].kind), {name: entry.value})
+                checked_entry(Entries(TASK.keys[name].kind), {name: entry.value})
 
 
 def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

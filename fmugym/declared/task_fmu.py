@@ -15,7 +15,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.declared.entries import Entry
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, TaskError, missing_file
-from fmugym.keys import table_of
+from fmugym.keys import table_of_fields
 from fmugym.systems import Component, FMUSystem
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
@@ -171,7 +171,9 @@ _known: Final[dict[Any, FMUSystem]] = {}
 
 def _component(entry: Entry) -> tuple[Component, _State]:
     fmu = entry if entry.child("fmu").value is None else entry.child("fmu")
-    own = {name: entry.value[name] for name in table_of(Component).keys if name in entry.value}
+    own = {
+        name: entry.value[name] for name in table_of_fields(Component).keys if name in entry.value
+    }
     state = _state(fmu, _path(fmu))
     with entry.placing():
         return Component(**{**own, "fmu": state[0]}), state

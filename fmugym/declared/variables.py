@@ -27,8 +27,8 @@ __all__ = [
     "NAMING",
     "TaskVariable",
     "TaskVariables",
-    "is_plain",
-    "start_value",
+    "declared_start",
+    "has_fmu_values",
 ]
 
 _PLAIN: Final = ("levels", "delta", "min_on", "min_off")
@@ -340,13 +340,13 @@ def _own_nominal(variable: Variable | None, conversion: Conversion) -> float | N
     return None if not own or conversion.offset else abs(own * conversion.factor)
 
 
-def is_plain(variable: TaskVariable) -> bool:
+def has_fmu_values(variable: TaskVariable) -> bool:
     """Whether the values of the task are those of the FMU."""
     is_same = variable.conversion == IDENTITY and not variable.levels
     return is_same and variable.is_direct
 
 
-def start_value(variable: TaskVariable, entry: Entry) -> Any:
+def declared_start(variable: TaskVariable, entry: Entry) -> Any:
     """The value of a parameter: a number or distribution in the unit of the FMU, or a text.
 
     Raises:

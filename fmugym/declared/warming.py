@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from fmugym.baselines import Controller, ControllerTable, Signal
     from fmugym.baselines.law import Law
 
-__all__ = ["CLOCK", "WarmUpTable", "read_warm_up"]
+__all__ = ["WARM_UP_CLOCK", "WarmUpTable", "read_warm_up"]
 
-CLOCK: Final = "clock"
+WARM_UP_CLOCK: Final = "clock"
 """What schedules of a warm-up read; it is not rounded as measured values are."""
 
 THERMOSTATS: Final = ("thermostat", "hysteresis")
@@ -107,7 +107,7 @@ def _table(entries: Mapping[str, Any]) -> ControllerTable:
     table = ControllerTable(entries)
     for law in table.laws():
         if isinstance(law, Schedule):
-            law.clock = CLOCK
+            law.clock = WARM_UP_CLOCK
     return table
 
 

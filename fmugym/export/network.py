@@ -16,7 +16,7 @@ from fmugym.errors import ConfigError, shown
 
 __all__ = ["ACTIVATIONS", "Activation", "Layer", "Network", "Scaling", "network_of"]
 
-FloatArray = npt.NDArray[Any]
+_Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Activation:
     name: str
     arguments: tuple[float, ...] = ()
 
-    def __call__(self, values: FloatArray) -> FloatArray:
+    def __call__(self, values: _Array) -> _Array:
         """Apply the function."""
-        result: FloatArray = ACTIVATIONS[self.name](values, *self.arguments)
+        result: _Array = ACTIVATIONS[self.name](values, *self.arguments)
         return result.astype(values.dtype)
 
 
-def _softplus(x: FloatArray, beta: float, threshold: float) -> FloatArray:
+def _softplus(x: _Array, beta: float, threshold: float) -> _Array:
     scaled = x * beta
     return np.where(scaled > threshold, x, np.log1p(np.exp(np.minimum(scaled, threshold))) / beta)
 
@@ -79,8 +79,8 @@ class Layer:
         activations: Applied in this order.
     """
 
-    weights: FloatArray
-    bias: FloatArray
+    weights: _Array
+    bias: _Array
     activations: tuple[Activation, ...] = ()
 
 
@@ -93,9 +93,9 @@ class Scaling:
         limit: The largest magnitude of each element afterwards; infinite for none.
     """
 
-    mean: FloatArray
-    divisor: FloatArray
-    limit: FloatArray
+    mean: _Array
+    divisor: _Array
+    limit: _Array
 
     def __call__(self, observation: Iterable[Any]) -> list[Any]:
         """Normalize the elements of an observation, numbers or formulas, with float64."""
@@ -173,16 +173,16 @@ class Network:
         """What the first layer takes, in its type then, of numbers or formulas."""
         return observation if self.scaling is None else self.scaling(observation)
 
-    def values(self, observation: FloatArray) -> FloatArray:
+    def values(self, observation: _Array) -> _Array:
         """The last values for an observation of shape (k,)."""
-        values: FloatArray = np.array(self.scaled([*observation]), self.dtype)
+        values: _Array = np.array(self.scaled([*observation]), self.dtype)
         for layer in self.layers:
             values = layer.weights @ values + layer.bias
             for activation in layer.activations:
                 values = activation(values)
         return values
 
-    def action(self, observation: FloatArray) -> FloatArray:
+    def action(self, observation: _Array) -> _Array:
         """The action for an observation of shape (k,), flat."""
         return np.array(self.chosen([*self.values(observation)]), self.space.dtype)
 
@@ -262,8 +262,8 @@ def _linear(module: Any) -> Layer:
     return Layer(weights, bias)
 
 
-def _numbers(tensor: Any) -> FloatArray:
-    array: FloatArray = tensor.detach().cpu().numpy().copy()
+def _numbers(tensor: Any) -> _Array:
+    array: _Array = tensor.detach().cpu().numpy().copy()
     if array.dtype not in (np.float32, np.float64) or not np.isfinite(array).all():
         raise ConfigError(
             f"the weights of a network must be finite numbers of type float32 or float64, got "

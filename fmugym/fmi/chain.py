@@ -13,15 +13,15 @@ from fmugym.systems.system_description import PartVariable
 
 __all__ = ["chained_jacobian"]
 
-FloatArray = npt.NDArray[np.float64]
+_FloatArray = npt.NDArray[np.float64]
 Ends = Sequence[Sequence[PartVariable]]
-Differentiate = Callable[[int, tuple[Variable, ...], tuple[Variable, ...]], FloatArray]
+Differentiate = Callable[[int, tuple[Variable, ...], tuple[Variable, ...]], _FloatArray]
 """Takes the number of a component, its k unknowns and its m knowns; gives shape (N, k, m)."""
 
 
 def chained_jacobian(
     layout: Layout, differentiate: Differentiate, count: int, unknowns: Ends, knowns: Ends
-) -> FloatArray:
+) -> _FloatArray:
     """Differentiate variables of a system by others, as if values were exchanged at all times.
 
     What connections carry, y, depends on the knowns k directly and by way of other connections:
@@ -57,12 +57,12 @@ class _Chain:
         self._layout, self._differentiate = layout, differentiate
         self._count, self._routes = count, routes
 
-    def by_routes(self, ends: Sequence[PartVariable]) -> FloatArray:
+    def by_routes(self, ends: Sequence[PartVariable]) -> _FloatArray:
         """By the sources of connections, which act on their targets."""
         targets = [[_target(self._layout, route)] for route in self._routes]
         return self.by_knowns(ends, targets)
 
-    def by_knowns(self, ends: Sequence[PartVariable], knowns: Ends) -> FloatArray:
+    def by_knowns(self, ends: Sequence[PartVariable], knowns: Ends) -> _FloatArray:
         """By variables, without the way of connections."""
         result = np.zeros((self._count, len(ends), len(knowns)))
         for part in {end.part for end in ends}:

@@ -25,7 +25,7 @@ from fmugym.checks import (
     check_number,
     check_seed,
 )
-from fmugym.distributions import Column
+from fmugym.distributions import DrawnColumn
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
@@ -114,10 +114,10 @@ class FitResult:
         factor, errors = self.factor(level), self.standard_errors
         return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
 
-    def distributions(self) -> dict[str, Column]:
+    def distributions(self) -> dict[str, DrawnColumn]:
         """Return the values as parameters of which each episode draws one of 1000 ``rows``."""
         columns = zip(self.values, self.rows(1000).T.tolist(), strict=True)
-        return {name: Column(values, table="fit") for name, values in columns}
+        return {name: DrawnColumn(values, table="fit") for name, values in columns}
 
     def untold(self) -> list[dict[str, float]]:
         """Name what the data do not tell: combinations of parameters that are hardly determined.

@@ -11,8 +11,9 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.baselines.arena import Arena
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.parsing import has_range, search_of
+from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.search.flattening import choices_of
 from fmugym.search.policy import Agent, Policy

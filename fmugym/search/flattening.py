@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.controller import FloatArray
 from fmugym.errors import ConfigError
+from fmugym.pool.base import FloatArray
 
 __all__ = ["choices_of", "require_numbers", "rows_of"]
 

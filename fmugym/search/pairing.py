@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.baselines.controller import FloatArray
+from fmugym.pool.base import FloatArray
 
 __all__ = ["MOST_PAIRED", "best_pairing", "niederlinski_index", "relative_gains"]
 

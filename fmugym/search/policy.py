@@ -17,7 +17,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.baselines.arena import Arena, Outcome
-from fmugym.baselines.controller import Controller, FloatArray, attribute_of, either, limited
+from fmugym.baselines.controller import Controller, attribute_of, either, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.baselines.tuning import numbers_at
 from fmugym.checks import (
@@ -28,9 +28,10 @@ from fmugym.checks import (
     check_text,
     require_regular,
 )
-from fmugym.errors import ConfigError, reading, shown
+from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.expressions.value import Value
 from fmugym.files import write_whole
+from fmugym.pool.base import FloatArray
 from fmugym.search.flattening import choices_of, rows_of
 
 __all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
@@ -185,7 +186,7 @@ class Agent:
         """
         failure = f"the agent in {shown(str(folder))} cannot be read"
         try:
-            with reading(failure):
+            with reading_file(failure):
                 require_regular(folder / AGENT)
                 text = (folder / AGENT).read_text(encoding="utf-8")
                 return cls._checked(check_mapping(AGENT, json.loads(text)))

@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.controller import Controller, FloatArray, limited
+from fmugym.baselines.controller import Controller, limited
 from fmugym.errors import ConfigError
 from fmugym.expressions.value import Value
+from fmugym.pool.base import FloatArray
 from fmugym.search.policy import Agent, Memory, Policy
 
 __all__ = ["Residual"]

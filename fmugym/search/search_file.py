@@ -120,7 +120,7 @@ def search_in(content: bytes) -> Search:
         content: That of the file.
 
     Raises:
-        Exception: Of any kind, if the file is damaged; see ``fmugym.errors.reading``.
+        Exception: Of any kind, if the file is damaged; see ``fmugym.errors.reading_file``.
     """
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}

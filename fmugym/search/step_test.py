@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.baselines.arena import Arena
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
+from fmugym.pool.base import FloatArray
 
 __all__ = ["FEWEST", "StepResponses", "episodes_of", "step_test"]
 

@@ -20,9 +20,9 @@ from fmugym.keys import (
     Key,
     Listed,
     Table,
-    checked,
+    checked_entry,
     option,
-    table_of,
+    table_of_fields,
 )
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
@@ -39,7 +39,7 @@ LOOPS: Final = ("newton", "refuse")
 SYSTEM: Final = Table(
     {
         "components": Key(
-            Entries(table_of(Component, make=Component, short="fmu")),
+            Entries(table_of_fields(Component, make=Component, short="fmu")),
             "By name: the path of an FMU, or a [component](systems.md#connect-fmus).",
             REQUIRED,
         ),
@@ -131,7 +131,7 @@ class WiredSystem:
             "stop_time": stop_time,
             "tolerance": tolerance,
         }
-        self._given = given = checked(SYSTEM, told)
+        self._given = given = checked_entry(SYSTEM, told)
         if not given["components"]:
             raise ConfigError("a system needs at least one component")
         self.name, self.description = given["name"], given["description"]

@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.baselines.arena import most_steps_of
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.parsing import controller_of, has_range, plans_ahead, simple_controllers
 from fmugym.baselines.table import ControllerTable
 from fmugym.baselines.table_texts import is_table, named_controllers, parts_of
@@ -31,6 +31,7 @@ from fmugym.episodes.simulation import action_of
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
 from fmugym.fmi.words import asked_for
+from fmugym.pool.base import FloatArray
 from fmugym.search.probe import MOST_PROBED
 from fmugym.search.search import tuning_steps
 from fmugym.series.choice import quantities_of

@@ -19,7 +19,7 @@ from fmugym.baselines import Controller
 from fmugym.checks import check_option, check_path, require_regular
 from fmugym.env import FMUEnv
 from fmugym.episodes.simulation import Player, Policy, policy_of_controller
-from fmugym.errors import ConfigError, reading, shown
+from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.extras import imported
 from fmugym.files import replaced_together
 from fmugym.scaling import are_scaled, unscaled
@@ -190,7 +190,7 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     file = path if path.is_file() else path / _MODEL
     facts: dict[str, Any] = {"algorithm": algorithm} if path.is_file() else _facts_in(path)
     kind = algorithm_of(facts["algorithm"])
-    with reading(f"the agent in {shown(str(path))} cannot be read"):
+    with reading_file(f"the agent in {shown(str(path))} cannot be read"):
         require_regular(file)
         model, normalization = kind.load(file, device="cpu"), _normalization_in(file.parent)
         if facts.get("residual") is None:

@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import FMUGymError, reading, shown
+from fmugym.errors import FMUGymError, reading_file, shown
 from fmugym.files import write_whole
 from fmugym.training.agents import algorithm_of, read_facts
 
@@ -119,7 +119,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, int]:
         ConfigError: If there is none.
     """
     facts = read_facts(folder, CHECKPOINT, NOTHING_TO_RESUME, "folder", "steps")
-    with reading(f"{shown(str(folder))} {NOTHING_TO_RESUME}"):
+    with reading_file(f"{shown(str(folder))} {NOTHING_TO_RESUME}"):
         return folder / facts["folder"], int(facts["steps"])
 
 
@@ -140,7 +140,7 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
         ConfigError: If there is none, its files are damaged, or it is of another task.
     """
     place, _ = latest_checkpoint(folder)
-    with reading(f"the checkpoint in {shown(str(folder))} cannot be resumed"):
+    with reading_file(f"the checkpoint in {shown(str(folder))} cannot be resumed"):
         return _loaded(place, algorithm, venv)
 
 

@@ -18,7 +18,7 @@ from fmugym.baselines.entrants import NO_MERIT
 from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
-from fmugym.errors import ConfigError, reading, reason, shown
+from fmugym.errors import ConfigError, reading_file, reason, shown
 from fmugym.files import replaced_together
 from fmugym.pool.processors import available_processors
 from fmugym.search.guessing import MOST_TESTED
@@ -169,7 +169,7 @@ class Searching:
             ConfigError: If there is none, it is damaged, or it is of another task.
         """
         name = shown(str(self.folder))
-        with reading(f"{name} has no search to resume"):
+        with reading_file(f"{name} has no search to resume"):
             found = search_in((self.folder / STATE).read_bytes())
         with closing(self.make_env()) as env:
             before, now = plain_of(found.probe.task), plain_of(task_of(env))
