@@ -20,7 +20,7 @@ def main() -> int:
         sys.path.append("")  # module:Class may be in the working directory
         from fmugym.tools import cli
 
-        return cli.main()
+        return cli.run_command_line()
     except KeyboardInterrupt as error:
         return exit_code(error)
 

@@ -155,11 +155,11 @@ def test_a_checkpoint(tmp_path, monkeypatch):
 def test_the_curve_and_its_picture(tmp_path):
     pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
     for steps in (1, 2):
-        diary.note(tmp_path, ("steps", "reward"), (steps, 0.5))
+        diary.append_row(tmp_path, ("steps", "reward"), (steps, 0.5))
     assert outcome.write_curve(tmp_path, "title", print) is not None
     unchanged(tmp_path, lambda: outcome.write_curve(tmp_path, "another", print))
-    unchanged(tmp_path, lambda: diary.note(tmp_path, (), ("x" * ROOM, 0.5)))
-    diary.note(tmp_path, ("steps", "reward"), (3, 0.5))
+    unchanged(tmp_path, lambda: diary.append_row(tmp_path, (), ("x" * ROOM, 0.5)))
+    diary.append_row(tmp_path, ("steps", "reward"), (3, 0.5))
     assert (tmp_path / "evaluations.csv").read_text() == "steps,reward\n1,0.5\n2,0.5\n3,0.5\n"
 
 

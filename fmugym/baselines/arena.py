@@ -19,7 +19,15 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.pool.processors import available_processors
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome", "most_steps_of"]
+__all__ = [
+    "MOST_ENVS",
+    "MOST_STEPS",
+    "Arena",
+    "ArenaResult",
+    "CeilingError",
+    "Merit",
+    "most_steps_of",
+]
 
 MOST_ENVS: Final = 256
 """As many environments step together, unless the caller says less: more would hardly be faster."""
@@ -40,7 +48,7 @@ class CeilingError(FMUGymError):
     """An arena may not take more steps."""
 
 
-class Outcome(NamedTuple):
+class ArenaResult(NamedTuple):
     """What n candidates have reached in k episodes.
 
     Attributes:
@@ -128,7 +136,7 @@ class Arena:
         numbers: FloatArray,
         seeds: Sequence[int],
         has_moments: bool = False,
-    ) -> Outcome:
+    ) -> ArenaResult:
         """Let candidates play.
 
         Args:
@@ -158,7 +166,7 @@ class Arena:
             groups.append(totals[:, places])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
         costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
-        return Outcome(totals[0], costs, self.limits, moments)
+        return ArenaResult(totals[0], costs, self.limits, moments)
 
     def open(self, jobs: int) -> FMUVectorEnv:
         """Make the environments for so many episodes, unless there are enough.

@@ -20,20 +20,20 @@ from fmugym.pool.base import FloatArray
 
 __all__ = [
     "Controller",
-    "Numbers",
-    "Signal",
+    "NumberOrArray",
+    "SignalReference",
     "attribute_of",
-    "check_numbers",
+    "checked_numbers",
     "either",
     "limited",
     "require_physical",
 ]
 
 
-Numbers = float | FloatArray
+NumberOrArray = float | FloatArray
 """A number, or an array of shape (N,) with one for each environment."""
 
-Signal = str | Numbers
+SignalReference = str | NumberOrArray
 """An element of the observation by name, an expression of them, or a constant."""
 
 
@@ -201,7 +201,7 @@ class Controller(KnownArguments, ABC):
 
     # Shared by controllers.
 
-    def _value(self, seen: Sequence[Any], signal: Signal) -> Any:
+    def _value(self, seen: Sequence[Any], signal: SignalReference) -> Any:
         """The value of a signal.
 
         Args:
@@ -213,10 +213,10 @@ class Controller(KnownArguments, ABC):
         formula, evaluate = self._signals[signal]
         return formula(seen) if isinstance(seen[0], Value) else evaluate(seen)
 
-    def _check_signal(self, what: str, signal: Signal) -> None:
+    def _check_signal(self, what: str, signal: SignalReference) -> None:
         """Check a signal; one that is no name may be an expression."""
         if not isinstance(signal, str):
-            self._check_size(what, check_numbers(what, signal))
+            self._check_size(what, checked_numbers(what, signal))
         elif signal.isidentifier() or self._is_name(signal):
             self._check_name(what, signal)
             element = itemgetter(self._place_of(signal))
@@ -242,7 +242,7 @@ class Controller(KnownArguments, ABC):
             return self.names.index(name)
         return self.names.index(str(Spellings("observation", self.names).find(name)))
 
-    def _check_size(self, what: str, numbers: Numbers | None) -> None:
+    def _check_size(self, what: str, numbers: NumberOrArray | None) -> None:
         """Check that an array has one number for each environment."""
         size = np.size(numbers) if np.ndim(numbers) else self.count  # type: ignore[arg-type] # None is a scalar, too
         if size != self.count:
@@ -310,7 +310,7 @@ def either(condition: Any, first: Any, second: Any) -> Any:
     return np.where(condition, first, second)
 
 
-def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:
+def checked_numbers(what: str, value: Any, **limits: Any) -> NumberOrArray:
     """Return a number as a float, or those of a one-dimensional array as floats.
 
     Args:

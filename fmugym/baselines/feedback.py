@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, Numbers, Signal, check_numbers, either, limited
+from fmugym.baselines.controller import (
+    Controller,
+    NumberOrArray,
+    SignalReference,
+    checked_numbers,
+    either,
+    limited,
+)
 from fmugym.baselines.law import Decided, Law
 from fmugym.errors import ConfigError
 from fmugym.expressions.value import Value
@@ -37,11 +44,16 @@ class Hysteresis(Law):
     signals = ("of", "setpoint")
 
     def __init__(
-        self, of: str, setpoint: Signal, band: Numbers, below: Numbers = 1.0, above: Numbers = 0.0
+        self,
+        of: str,
+        setpoint: SignalReference,
+        band: NumberOrArray,
+        below: NumberOrArray = 1.0,
+        above: NumberOrArray = 0.0,
     ) -> None:
         self.of, self.setpoint = of, setpoint
-        self.band = check_numbers("band", band, minimum=0.0)
-        self.below, self.above = check_numbers("below", below), check_numbers("above", above)
+        self.band = checked_numbers("band", band, minimum=0.0)
+        self.below, self.above = checked_numbers("below", below), checked_numbers("above", above)
         self.starts = (self.above,)
 
     def _prepare(self) -> None:
@@ -88,17 +100,17 @@ class PID(Law):
     def __init__(
         self,
         of: str,
-        setpoint: Signal,
-        kp: Numbers,
-        ti: Numbers | None = None,
-        td: Numbers = 0.0,
-        offset: Numbers = 0.0,
+        setpoint: SignalReference,
+        kp: NumberOrArray,
+        ti: NumberOrArray | None = None,
+        td: NumberOrArray = 0.0,
+        offset: NumberOrArray = 0.0,
     ) -> None:
         self.of, self.setpoint = of, setpoint
-        self.kp = check_numbers("kp", kp)
-        self.ti = None if ti is None else check_numbers("ti", ti, minimum=0.0, positive=True)
-        self.td = check_numbers("td", td, minimum=0.0)
-        self.offset = check_numbers("offset", offset)
+        self.kp = checked_numbers("kp", kp)
+        self.ti = None if ti is None else checked_numbers("ti", ti, minimum=0.0, positive=True)
+        self.td = checked_numbers("td", td, minimum=0.0)
+        self.offset = checked_numbers("offset", offset)
         self.starts = (0.0, np.nan)
 
     def _prepare(self) -> None:

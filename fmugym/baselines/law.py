@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.controller import Controller, Numbers
+from fmugym.baselines.controller import Controller, NumberOrArray
 from fmugym.expressions.value import Value
 from fmugym.pool.base import FloatArray
 
@@ -27,7 +27,7 @@ class Law(Controller):
         signals: The attributes that are signals.
     """
 
-    starts: tuple[Numbers, ...] = ()
+    starts: tuple[NumberOrArray, ...] = ()
     _before: tuple[Sequence[Any], Sequence[Any]]
     signals: ClassVar[tuple[str, ...]] = ()
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.baselines.controller import Controller, attribute_of
-from fmugym.baselines.observer import COPIES, CORRECTION, Observer, spread
+from fmugym.baselines.observer import COPIES, CORRECTION, Observer, parameters_of_copies
 from fmugym.checks import (
     LARGEST_COUNT,
     check_count,
@@ -299,7 +299,7 @@ class MPC(Controller):
     def _begun(self, env: FMUEnv) -> _Episode:
         """Begin an episode of the copies; the first one has the nominal parameters."""
         copied, episode = self._copies, _Episode()
-        values = spread(self._prototype, self.seed)
+        values = parameters_of_copies(self._prototype, self.seed)
         if self._prototype.config.draws_start_time:
             values["start_time"] = np.full(COPIES, env.time - env.step_count * self.time_step)
         for place in range(COPIES if values else 1):
@@ -390,7 +390,9 @@ class MPC(Controller):
         values = expected + part * (row[self._places] - expected)
         values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
-        nominal = {n: float(v[0]) for n, v in spread(self._prototype, self.seed).items()}
+        nominal = {
+            n: float(v[0]) for n, v in parameters_of_copies(self._prototype, self.seed).items()
+        }
         copied = self._copies
         seed = self.seed + episode.steps
         copied.reset(seed=seed, options={"model_parameters": nominal | starts})

@@ -11,7 +11,7 @@ from fmugym.distributions import DrawnColumn, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray
 
-__all__ = ["COPIES", "CORRECTION", "Observer", "spread"]
+__all__ = ["COPIES", "CORRECTION", "Observer", "parameters_of_copies"]
 
 COPIES: Final = 9
 """So many different copies run beside each environment."""
@@ -73,7 +73,7 @@ class Observer:
         return int(parts.sum(axis=1).argmin())
 
 
-def spread(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
+def parameters_of_copies(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
     """Values of the parameters that are drawn, by name, one for each copy; medians come first.
 
     Columns of a table have whole rows, from the nearest to the medians to one far away.

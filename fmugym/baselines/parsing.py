@@ -33,7 +33,7 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.base import FloatArray
 
 __all__ = [
-    "Search",
+    "TunableController",
     "controller_of",
     "has_range",
     "plans_ahead",
@@ -104,7 +104,7 @@ def _parts(text: str) -> tuple[str, dict[str, Any]]:
     return kind, dict(map(_argument, words))
 
 
-class Search(ABC):
+class TunableController(ABC):
     """A controller some of whose numbers are to be found.
 
     Attributes:
@@ -141,13 +141,13 @@ class Search(ABC):
 
 
 @dataclass(frozen=True)
-class TextSearch(Search):
+class TextSearch(TunableController):
     """The search for numbers of a controller that a text names.
 
     Attributes:
         kind: The name of its class in texts.
         fixed: The arguments that are given.
-        ranges: See ``Search``.
+        ranges: See ``TunableController``.
         negative: The names of those whose values are minus those in ``ranges``.
     """
 
@@ -157,18 +157,18 @@ class TextSearch(Search):
     negative: frozenset[str] = frozenset()
 
     def make(self, **numbers: Any) -> Controller:
-        """See ``Search.make``."""
+        """See ``TunableController.make``."""
         return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
 
     def text(self, numbers: Mapping[str, Any]) -> str:
-        """See ``Search.text``."""
+        """See ``TunableController.text``."""
         found = self.numbers(numbers)
         given = {name: found.get(name, value) for name, value in self._in_order().items()}
         words = [f"{name}={str(value).removesuffix('.0')}" for name, value in given.items()]
         return shlex.join([self.kind, *words])
 
     def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """See ``Search.numbers``."""
+        """See ``TunableController.numbers``."""
         return {
             name: _rounded(-value if name in self.negative else value)
             for name, value in found.items()
@@ -181,7 +181,7 @@ class TextSearch(Search):
 
 
 @dataclass(frozen=True)
-class TableSearch(Search):
+class TableSearch(TunableController):
     """The search for all numbers of a table, whose names are such as ``"u.kp"``.
 
     Attributes:
@@ -190,11 +190,11 @@ class TableSearch(Search):
     """
 
     entries: Mapping[str, Any]
-    searches: Mapping[str, Search]
+    searches: Mapping[str, TunableController]
 
     @property
     def ranges(self) -> Mapping[str, Uniform | LogUniform]:  # type: ignore[override]  # a field there
-        """See ``Search``."""
+        """See ``TunableController``."""
         return {
             f"{name}.{key}": one
             for name, search in self.searches.items()
@@ -202,12 +202,12 @@ class TableSearch(Search):
         }
 
     def make(self, **numbers: Any) -> Controller:
-        """See ``Search.make``."""
+        """See ``TunableController.make``."""
         own = self._divided(numbers)
         return _table(self.entries, {n: one.make(**own[n]) for n, one in self.searches.items()})
 
     def text(self, numbers: Mapping[str, Any]) -> str:
-        """See ``Search.text``."""
+        """See ``TunableController.text``."""
         own = self._divided(numbers)
         texts = {name: one.text(own[name]) for name, one in self.searches.items()}
         return text_of(
@@ -218,7 +218,7 @@ class TableSearch(Search):
         )
 
     def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """See ``Search.numbers``."""
+        """See ``TunableController.numbers``."""
         own = self._divided(found)
         return {
             f"{name}.{key}": value
@@ -235,7 +235,7 @@ class TableSearch(Search):
         return found
 
 
-def search_of(text: str | Mapping[str, Any]) -> Search:
+def search_of(text: str | Mapping[str, Any]) -> TunableController:
     """Read a controller of which some numbers are ranges.
 
     Args:

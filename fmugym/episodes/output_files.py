@@ -14,7 +14,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.series import RecordSeries, TimeSeries, plot, write_report
 
-__all__ = ["About", "Recording", "require_format", "require_picture", "title_of"]
+__all__ = ["About", "EpisodeFiles", "require_format", "require_picture", "title_of"]
 
 _TABLES: Final = (".csv", ".parquet")
 _PICTURES: Final = (".png", ".svg", ".pdf")
@@ -81,7 +81,7 @@ class About:
         return cls(facts, str(task.document.get("description", "")), text)
 
 
-class Recording:
+class EpisodeFiles:
     """The episodes of one controller after another, and the files about them.
 
     Args:

@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from importlib import import_module
 from typing import Final
 
-__all__ = ["Advance", "no_progress", "progress", "quiet"]
+__all__ = ["Advance", "no_progress", "progress_bar", "quiet"]
 
 Advance = Callable[..., None]
 """Is told how many steps were done since the last call, and perhaps a text to show beside."""
@@ -34,7 +34,7 @@ def _is_watched() -> bool:
 
 
 @contextmanager
-def progress(total: float | None, what: str, unit: str = "steps") -> Iterator[Advance]:
+def progress_bar(total: float | None, what: str, unit: str = "steps") -> Iterator[Advance]:
     """Show a bar and the time left, in a terminal or a notebook, if tqdm is installed (``sb3``).
 
     Args:

@@ -18,7 +18,7 @@ from fmugym.export.network import Activation, Layer, Network, Scaling
 from fmugym.export.policies import network_of_model
 from fmugym.expressions.value import Value
 from fmugym.scaling import are_scaled
-from fmugym.search.policy import LIMIT, Agent, Policy
+from fmugym.search.policy import LIMIT, ResidualAgent, ResidualPolicy
 from fmugym.search.residual import Residual
 
 __all__ = ["Decision", "decision_of"]
@@ -62,9 +62,9 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     Raises:
         ConfigError: If the agent cannot be exported, or is for another task.
     """
-    model = model.policy() if isinstance(model, Agent) else model
+    model = model.policy() if isinstance(model, ResidualAgent) else model
     if isinstance(model, Controller):
-        policy = copy(model) if isinstance(model, Policy) else Policy(model)
+        policy = copy(model) if isinstance(model, ResidualPolicy) else ResidualPolicy(model)
         policy.baseline = deepcopy(policy.baseline)
         return _of_policy(policy.bind(env))
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
@@ -73,7 +73,7 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     return Decision(network, lambda seen, memory, ask: (network.chosen(ask(seen)), ()))
 
 
-def _of_policy(policy: Policy) -> Decision:
+def _of_policy(policy: ResidualPolicy) -> Decision:
     if policy.choices and policy.masks is not None:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
     controller, past = policy.baseline, policy.starts
@@ -107,7 +107,7 @@ def _of_policy(policy: Policy) -> Decision:
     return Decision(network, decide, starts)
 
 
-def _network_of(policy: Policy) -> tuple[Network | None, _Ask]:
+def _network_of(policy: ResidualPolicy) -> tuple[Network | None, _Ask]:
     """The network, and what its last values mean.
 
     There is none if nobody corrects the controller, or the network sees nothing and so gives

@@ -14,9 +14,9 @@ from fmugym.errors import ConfigError, shown
 from fmugym.export.decisions import decision_of
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
-from fmugym.search.policy import Agent as FoundAgent
+from fmugym.search.policy import ResidualAgent
 
-__all__ = ["Agent", "agent_of", "check_name"]
+__all__ = ["ExportedAgent", "agent_of", "check_name"]
 
 
 _TAKEN: Final = frozenset(
@@ -29,7 +29,7 @@ _TAKEN: Final = frozenset(
 
 
 @dataclass(frozen=True)
-class Agent:
+class ExportedAgent:
     """An agent of a task.
 
     Attributes:
@@ -62,7 +62,7 @@ def agent_of(
     name: str = "agent",
     all_inputs: bool = False,
     external: Collection[str] = (),
-) -> Agent:
+) -> ExportedAgent:
     """Put an agent together from its task and its policy.
 
     Args:
@@ -83,7 +83,9 @@ def agent_of(
     check_name(name)
     decision = decision_of(env, model, normalization)
     logic = logic_of(env, decision, all_inputs=all_inputs, external=external)
-    return Agent(name, logic, decision.network, _notes(env, model), env.fmu.description.units)
+    return ExportedAgent(
+        name, logic, decision.network, _notes(env, model), env.fmu.description.units
+    )
 
 
 def check_name(name: str) -> str:
@@ -103,7 +105,7 @@ def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:
     spec = getattr(env, "spec", None)
     task = type(env).__name__ if spec is None else str(spec.id)
     policy = type(model).__name__
-    if isinstance(model, FoundAgent):
+    if isinstance(model, ResidualAgent):
         policy = model.name if model.text is None else f"{model.name} ({model.text})"
     return (
         f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {policy}.",

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import Unit
-from fmugym.export.exportable import Agent, check_name
+from fmugym.export.exportable import ExportedAgent, check_name
 from fmugym.export.logic import Kept, Logic, Parameter
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.value import Value, where
@@ -21,7 +21,7 @@ __all__ = ["agent_of_surrogate"]
 _DOUBLE: Final = np.dtype(np.float64)
 
 
-def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit]) -> Agent:
+def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit]) -> ExportedAgent:
     """A surrogate in the form of an agent: the FMU's inputs are measurements, its outputs actions.
 
     The first sample gives the outputs at the start, and each other one those after a step. What
@@ -37,7 +37,7 @@ def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit
     """
     logic = _Writer(surrogate).logic()
     note = f"Surrogate: {surrogate.terms.form}; fitted to simulations of an FMU."
-    return Agent(check_name(name), logic, None, (note,), units, is_plant=True)
+    return ExportedAgent(check_name(name), logic, None, (note,), units, is_plant=True)
 
 
 class _Writer:

@@ -8,13 +8,13 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any, Final
 
-__all__ = ["Background"]
+__all__ = ["BackgroundLoop"]
 
 _JOIN_SECONDS: Final = 0.1
 """How long to wait for the effect of a cancellation, in seconds."""
 
 
-class Background:
+class BackgroundLoop:
     """Runs a coroutine in a thread until it ends, or is stopped.
 
     Args:

@@ -13,7 +13,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.spelling import as_declared
 from fmugym.errors import ConfigError, shown
 from fmugym.logs import declared_as
-from fmugym.plant.tags import DATA, Plant
+from fmugym.plant.tags import DATA_PREFIX, Plant
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Live", "forecasts", "horizon"]
@@ -77,7 +77,7 @@ class Live:
             try:
                 rows = self._rows(name, entry, now, tags)
             except ConfigError as error:
-                faults[DATA + name] = str(error)
+                faults[DATA_PREFIX + name] = str(error)
             else:
                 self._write(name, *rows)
         return faults
@@ -87,7 +87,7 @@ class Live:
     ) -> tuple[FloatArray, FloatArray]:
         """Times from now on, in seconds of the year, and the values in the unit of the data."""
         if "file" not in entry.value:
-            values = np.array(tags[DATA + name])
+            values = np.array(tags[DATA_PREFIX + name])
             return now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values
         rows = read_rows(entry, self._standard)
         with entry.placing():

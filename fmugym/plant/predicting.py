@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmugym.baselines.observer import COPIES, Observer, spread
+from fmugym.baselines.observer import COPIES, Observer, parameters_of_copies
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
 from fmugym.plant.written import Written
@@ -54,7 +54,7 @@ class Predictions:
     def __init__(self, make_env: Callable[[], TaskEnv], feed: Feed, steps: int) -> None:
         self._feed = feed
         self.envs = [make_env()] if steps else []
-        self._spread = spread(self.envs[0], 0) if steps else {}
+        self._spread = parameters_of_copies(self.envs[0], 0) if steps else {}
         self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
         self._written = [Written(env, feed) for env in self.envs]
         self._tags = feed.plant.of(self.envs[0].inside.spec.outputs) if steps else []

@@ -17,9 +17,9 @@ from fmugym.declared.format import DEVICE
 from fmugym.declared.series import Series, read_data
 from fmugym.episodes.simulation import Player, Policy, Summary, action_of, policy_of
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
-from fmugym.plant.background import Background
+from fmugym.plant.background import BackgroundLoop
 from fmugym.plant.polling import protocol_of
-from fmugym.plant.tags import DATA, Plant, Tag, read_plant
+from fmugym.plant.tags import DATA_PREFIX, Plant, Tag, read_plant
 from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 
 __all__ = ["Server", "endless", "environment"]
@@ -129,9 +129,9 @@ class _Twin:
 
     def _of_tag(self, tag: Tag, part: float, time: float) -> tuple[float, ...]:
         """What a tag has when some part of a step has passed."""
-        if tag.name.startswith(DATA):
+        if tag.name.startswith(DATA_PREFIX):
             ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
-            series = self._data[tag.name.removeprefix(DATA)]
+            series = self._data[tag.name.removeprefix(DATA_PREFIX)]
             own = series.files[int(self.env.variables.get(series.variable, 0))]
             return tuple(_at(own, time + ahead).tolist())
         if tag.name == "clock":
@@ -194,7 +194,7 @@ class Server:
         self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
         self.address = ""
         self.summary: Callable[[], Summary]
-        self._background = Background(self._serve, "plant server")
+        self._background = BackgroundLoop(self._serve, "plant server")
         while not (self.address or self.wait(0.01)):
             pass
 

@@ -20,7 +20,7 @@ from fmugym.plant.live import Live
 from fmugym.plant.polling import Poller, protocol_of
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
-from fmugym.plant.tags import DATA, read_plant
+from fmugym.plant.tags import DATA_PREFIX, read_plant
 from fmugym.plant.written import Written
 from fmugym.pool.backend.clocks import Clock, RealClock
 
@@ -92,7 +92,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _told(self, predicted: dict[str, float]) -> dict[str, Any]:
-        missing = tuple(name.removeprefix(DATA) for name in self._feed.faults)
+        missing = tuple(name.removeprefix(DATA_PREFIX) for name in self._feed.faults)
         info = {"proposed": self._proposed, "predicted": predicted, "missing": missing}
         fault = self._feed.told()
         return info | ({"fault": fault} if fault else {})
@@ -148,7 +148,7 @@ def connect(
             int(ahead / plant.step + 1e-9),
         )
         live = Live([env, *copies.envs], plant)
-        client = protocol_of(plant).PlantClient(plant)
+        client = protocol_of(plant).client(plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
         feed.open(poller, live)

@@ -16,9 +16,9 @@ from fmugym.declared.standard_time import standard_time
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.logs import declared_as
 
-__all__ = ["DATA", "Plant", "Tag", "read_plant"]
+__all__ = ["DATA_PREFIX", "Plant", "Tag", "read_plant"]
 
-DATA = "data."
+DATA_PREFIX = "data."
 """What the names of tags of live data begin with."""
 
 
@@ -160,7 +160,9 @@ def _tags(env: TaskEnv, entry: Entry, data: Mapping[str, Entry]) -> Iterator[Tag
         yield _tag(env, "clock", entry.child("clock"), "s")
     for name, one in data.items():
         if "file" not in one.value:
-            yield _tag(env, DATA + name, one, env.task.document["data"][name].get("unit", ""))
+            yield _tag(
+                env, DATA_PREFIX + name, one, env.task.document["data"][name].get("unit", "")
+            )
 
 
 def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from fmugym.baselines.parsing import has_range, search_of
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.search.flattening import choices_of
-from fmugym.search.policy import Agent, Policy
+from fmugym.search.policy import ResidualAgent, ResidualPolicy
 from fmugym.search.probe import Probe
 from fmugym.surrogate.courses import Course, Courses
 from fmugym.surrogate.surrogate import Surrogate
@@ -122,12 +122,12 @@ def excite(
             return
 
 
-def _excitation(arena: Arena, agent: Agent, seed: int, rows: FloatArray) -> Any:
+def _excitation(arena: Arena, agent: ResidualAgent, seed: int, rows: FloatArray) -> Any:
     """The excitation of the episodes that an arena plays next."""
     return Excitation(_untuned(agent), seed, arena.jobs)
 
 
-def _untuned(agent: Agent) -> Policy:
+def _untuned(agent: ResidualAgent) -> ResidualPolicy:
     """An agent whose numbers are in the middle of their ranges, and whose weights are 0."""
     if has_range(agent.text):
         middle = np.full(len(search_of(agent.text).ranges), 0.5)

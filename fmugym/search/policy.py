@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena, Outcome
+from fmugym.baselines.arena import Arena, ArenaResult
 from fmugym.baselines.controller import Controller, attribute_of, either, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.baselines.tuning import numbers_at
@@ -32,11 +32,11 @@ from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.expressions.value import Value
 from fmugym.files import write_whole
 from fmugym.pool.base import FloatArray
-from fmugym.search.flattening import choices_of, rows_of
+from fmugym.search.flattening import choices_of, flattened_observations
 
-__all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
+__all__ = ["LIMIT", "POLICY_FILE", "ResidualAgent", "ResidualPolicy", "require_task", "scale_of"]
 
-AGENT: Final = "policy.json"
+POLICY_FILE: Final = "policy.json"
 """The file of an agent in its folder."""
 
 LIMIT: Final = 5.0
@@ -48,7 +48,7 @@ _FADE: Final = 0.05
 _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
 
-Memory = tuple[FloatArray, ...]
+PolicyState = tuple[FloatArray, ...]
 """What a policy keeps from one step to the next: the last observation, its leaky integral, and the
 last action."""
 
@@ -57,7 +57,7 @@ def scale_of(moments: FloatArray) -> FloatArray:
     """What features are like.
 
     Args:
-        moments: The sums of what ``Policy.moments`` gives in each step.
+        moments: The sums of what ``ResidualPolicy.moments`` gives in each step.
 
     Returns:
         The mean of each feature, and its standard deviation, shape (2, f); constant ones are not
@@ -112,7 +112,7 @@ _CHECKS: Final[dict[str, Callable[[str, Any], Any]]] = {
 
 
 @dataclass(frozen=True)
-class Agent:
+class ResidualAgent:
     """A controller, and a network that corrects it.
 
     Until they are found, the text has ranges in the places of numbers, or the weights are missing.
@@ -143,35 +143,37 @@ class Agent:
     names: Sequence[str] = ()
     actions: str = ""
 
-    def __call__(self, rows: FloatArray) -> Policy:
+    def __call__(self, rows: FloatArray) -> ResidualPolicy:
         """The policy with what was missing, shape (n,) or (N, n), to be bound to N environments.
 
         Binding it raises ``ConfigError`` if the agent is for another task.
         """
         if has_range(self.text):
             tunable = search_of(self.text)
-            return Policy(tunable.make(**numbers_at(tunable.ranges, rows)))
+            return ResidualPolicy(tunable.make(**numbers_at(tunable.ranges, rows)))
         baseline = None if self.text is None else controller_of(self.text)
-        return Policy(baseline, replace(self, weights=rows))
+        return ResidualPolicy(baseline, replace(self, weights=rows))
 
-    def with_numbers(self, found: FloatArray) -> Agent:
+    def with_numbers(self, found: FloatArray) -> ResidualAgent:
         """The agent with what was missing, shape (n,)."""
         if has_range(self.text):
             tunable = search_of(self.text)
-            return Agent(f"tuned {self.name}", tunable.text(numbers_at(tunable.ranges, found)))
+            return ResidualAgent(
+                f"tuned {self.name}", tunable.text(numbers_at(tunable.ranges, found))
+            )
         return replace(self, weights=found)
 
-    def policy(self) -> Policy:
+    def policy(self) -> ResidualPolicy:
         """The controller, to be bound to an environment, as by a call."""
         return self(self.weights)
 
-    def play(self, arena: Arena, seeds: Sequence[int]) -> Outcome:
+    def play(self, arena: Arena, seeds: Sequence[int]) -> ArenaResult:
         """Let the agent play alone."""
         return arena.play(self, np.atleast_2d(self.weights), seeds)
 
     def save(self, folder: Path) -> None:
         """Write the agent to a folder; a file that is there is replaced."""
-        write_whole(folder / AGENT, self.content())
+        write_whole(folder / POLICY_FILE, self.content())
 
     def content(self) -> bytes:
         """The content of its file."""
@@ -187,9 +189,9 @@ class Agent:
         failure = f"the agent in {shown(str(folder))} cannot be read"
         try:
             with reading_file(failure):
-                require_regular(folder / AGENT)
-                text = (folder / AGENT).read_text(encoding="utf-8")
-                return cls._checked(check_mapping(AGENT, json.loads(text)))
+                require_regular(folder / POLICY_FILE)
+                text = (folder / POLICY_FILE).read_text(encoding="utf-8")
+                return cls._checked(check_mapping(POLICY_FILE, json.loads(text)))
         except ConfigError as error:
             raise ConfigError(f"{failure}: {str(error).removeprefix(f'{failure}: ')}") from error
 
@@ -265,10 +267,10 @@ def _faded(now: Any, last: Any, leaky: Any) -> Any:
     return either(last != last, now, leaky + _FADE * (now - leaky))
 
 
-_NO_NETWORK: Final = Agent("")
+_NO_NETWORK: Final = ResidualAgent("")
 
 
-class Policy(Controller):
+class ResidualPolicy(Controller):
     """A controller whose action a network corrects.
 
     Of a ``Box`` the action is that of the controller, and half of the range times what the network
@@ -283,7 +285,7 @@ class Policy(Controller):
 
     masks: Callable[[], Any] | None
 
-    def __init__(self, baseline: Controller | None, agent: Agent = _NO_NETWORK) -> None:
+    def __init__(self, baseline: Controller | None, agent: ResidualAgent = _NO_NETWORK) -> None:
         self.baseline, self.agent = baseline, agent
 
     def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
@@ -303,7 +305,7 @@ class Policy(Controller):
         return names or tuple(map(str, range(spaces.flatdim(self._seen))))
 
     def _rows(self, observation: Any) -> FloatArray:
-        return rows_of(self._seen, observation, self.count)
+        return flattened_observations(self._seen, observation, self.count)
 
     def _prepare(self) -> None:
         space: Any = self.space
@@ -368,7 +370,7 @@ class Policy(Controller):
         return np.repeat(np.array(middle)[:, None], self.count, axis=1)
 
     @property
-    def starts(self) -> Memory:
+    def starts(self) -> PolicyState:
         """What the network sees of the past, at the beginning of an episode."""
         if not self.agent.history:
             return ()

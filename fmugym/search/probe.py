@@ -17,9 +17,9 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import require_numbers
 from fmugym.search.guessing import MOST_TESTED, Loops, steps_of_test, suggested_controllers
-from fmugym.search.policy import Agent, Policy
+from fmugym.search.policy import ResidualAgent, ResidualPolicy
 
-__all__ = ["FEW", "MOST_PROBED", "Probe", "task_of"]
+__all__ = ["FEW", "MOST_PROBED", "Probe", "agent_task"]
 
 FEW: Final = 8
 """The candidates of a round for a controller, which has few numbers."""
@@ -50,7 +50,7 @@ class Probe:
     """What is known of a task.
 
     Attributes:
-        task: See ``task_of``.
+        task: See ``agent_task``.
         linear: The linear policy without a controller, whose weights are missing.
         agents: Controllers that the task declares and that do not plan ahead. Without any, those
             that suggest themselves, or else a constant action.
@@ -63,8 +63,8 @@ class Probe:
     """
 
     task: Mapping[str, Any]
-    linear: Agent
-    agents: Sequence[Agent]
+    linear: ResidualAgent
+    agents: Sequence[ResidualAgent]
     limits: Mapping[str, float]
     most_steps: int
     is_same: bool
@@ -99,14 +99,14 @@ class Probe:
         """
         with closing(make_env()) as env:
             require_numbers(env.observation_space, env.action_space)
-            policy, task = Policy(None).bind(env), task_of(env)
+            policy, task = ResidualPolicy(None).bind(env), agent_task(env)
             require_units(env)
             agents = list(_declared(task, env, tell))
             loops = None if agents else Loops.of(task, env)
             length = most_steps_of(env)
             limits = dict(getattr(env, "cost_limits", {}))
-        linear = Agent("linear", None, len(policy.names), policy.acting)
-        constant = Agent("constant action", acting=policy.acting)
+        linear = ResidualAgent("linear", None, len(policy.names), policy.acting)
+        constant = ResidualAgent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
         steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
@@ -156,13 +156,15 @@ class Probe:
         return self.seconds * self.usual_steps * FEW * episodes
 
 
-def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) -> Iterator[Agent]:
+def _declared(
+    task: Mapping[str, Any], env: Any, tell: Callable[[str], None]
+) -> Iterator[ResidualAgent]:
     """The controllers that a task declares, that do not plan ahead and that fit its actions."""
     given = task.get("controllers", {})
     for name, one in named_controllers(given).items():
         if plans_ahead(one):
             continue
-        agent = Agent(name, acting_text(one))
+        agent = ResidualAgent(name, acting_text(one))
         try:
             (controller,) = simple_controllers({name: agent.text})
             controller.bind(env)
@@ -175,7 +177,7 @@ def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) ->
 
 def _guessed(
     arena: Arena, loops: Loops | None, tell: Callable[[str], None], most_tested: int
-) -> Iterator[Agent]:
+) -> Iterator[ResidualAgent]:
     """Controllers that a step test suggests for some loops."""
     if loops is None:
         return
@@ -184,11 +186,11 @@ def _guessed(
     except ConfigError as error:
         tell(f"no controller is guessed: {error}")
     else:
-        yield from (Agent(name, text) for name, text in guesses.items())
+        yield from (ResidualAgent(name, text) for name, text in guesses.items())
 
 
-def task_of(env: Any) -> dict[str, Any]:
+def agent_task(env: Any) -> dict[str, Any]:
     """What agents are for: the observations, the action space, and what a task file declares."""
-    policy = Policy(None).bind(env)
+    policy = ResidualPolicy(None).bind(env)
     declared = env.task.document if hasattr(env, "task") else {}
     return {"observations": policy.names, "actions": str(policy.space), **declared}

@@ -14,7 +14,7 @@ from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import entrant_of
-from fmugym.search.policy import Agent, scale_of
+from fmugym.search.policy import ResidualAgent, scale_of
 from fmugym.search.probe import FEW, Probe
 
 __all__ = ["VALIDATION", "Search", "tuning_steps"]
@@ -219,20 +219,20 @@ class Search:
 
     # Who takes part.
 
-    def _entrant(self, agent: Agent, then: Agent | None = None) -> Entrant:
+    def _entrant(self, agent: ResidualAgent, then: ResidualAgent | None = None) -> Entrant:
         if has_range(agent.text):
             ranges = search_of(agent.text).ranges
             return entrant_of(agent, ranges, (_MANY, FEW), self.episodes, self.rng)
         return Entrant(self._cma(agent), agent, self.episodes, then)
 
-    def _cma(self, agent: Agent) -> CMA:
+    def _cma(self, agent: ResidualAgent) -> CMA:
         """The search for the weights of an agent, which begins with its own ones, or 0."""
         mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
         sigma = _OF_NETWORKS if agent.hidden else _OF_CORRECTIONS if agent.text else 1.0
         population = _MANY if agent.observed else FEW
         return CMA(mean, sigma, population, self.rng, largest=_LARGEST, growth=_GROWTH)
 
-    def _look(self, arena: Arena, baseline: Agent) -> None:
+    def _look(self, arena: Arena, baseline: ResidualAgent) -> None:
         """See what observations are like for the best of some candidates that correct the baseline.
 
         Policies that are worth something see the like, while others may drive the process far away.
@@ -253,7 +253,7 @@ class Search:
         if not self.widths:
             self._enter(history, baseline)
 
-    def _enter(self, history: Agent, baseline: Agent) -> None:
+    def _enter(self, history: ResidualAgent, baseline: ResidualAgent) -> None:
         """Let classes of policies enter. Linear ones are followed by those that see the past."""
         linear = self.probe.linear
         *linear_ones, network = (
@@ -268,7 +268,7 @@ class Search:
 
     # Who wins.
 
-    def last_validation(self) -> tuple[list[Agent], range]:
+    def last_validation(self) -> tuple[list[ResidualAgent], range]:
         """Who would compete if the search ended now, and the seeds of the episodes.
 
         These are the baseline and the best two searches, each by its best numbers and by its
@@ -287,7 +287,7 @@ class Search:
         most = self.rounds * FEW * self.episodes // (_PART * (len(agents) or 1))
         return agents, self._seeds(_FINAL, min(_LAST, max(self.episodes, most)))
 
-    def winner(self, arena: Arena) -> Agent | None:
+    def winner(self, arena: Arena) -> ResidualAgent | None:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
         return max(agents, key=lambda one: one.play(arena, seeds).merits[0], default=None)

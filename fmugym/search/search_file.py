@@ -19,7 +19,7 @@ from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.errors import ConfigError
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.search.probe import Probe
 from fmugym.search.search import Search
 
@@ -89,7 +89,9 @@ def _place(entrant: Entrant, among: list[Entrant]) -> int:
     return next(place for place, one in enumerate(among) if one is entrant)
 
 
-def _facts_of_agent(agent: Agent | None, keep: Callable[[Any], str]) -> dict[str, Any] | None:
+def _facts_of_agent(
+    agent: ResidualAgent | None, keep: Callable[[Any], str]
+) -> dict[str, Any] | None:
     if agent is None:
         return None
     facts = {one.name: getattr(agent, one.name) for one in fields(agent)}
@@ -168,11 +170,11 @@ class _Reader:
             usual_steps=_count(facts["usual_steps"], math.inf),
         )
 
-    def _agent(self, facts: Mapping[str, Any]) -> Agent:
+    def _agent(self, facts: Mapping[str, Any]) -> ResidualAgent:
         observed, acting, hidden = (_count(facts[n]) for n in ("observed", "acting", "hidden"))
         text = facts["text"]
         _require_controller(text)
-        agent = Agent(
+        agent = ResidualAgent(
             _kind(facts["name"], str),
             text,
             observed,
@@ -188,7 +190,7 @@ class _Reader:
             raise ValueError(f"{len(agent.weights)} weights, expected {agent.size}")
         return agent
 
-    def _optional_agent(self, facts: Mapping[str, Any] | None) -> Agent | None:
+    def _optional_agent(self, facts: Mapping[str, Any] | None) -> ResidualAgent | None:
         return None if facts is None else self._agent(facts)
 
     def _entrant(self, facts: Mapping[str, Any], search: Search) -> Entrant:
@@ -230,7 +232,7 @@ class _Reader:
         return array
 
 
-def _size_of(agent: Agent) -> int:
+def _size_of(agent: ResidualAgent) -> int:
     """How many numbers of an agent are sought."""
     return len(search_of(agent.text).ranges) if has_range(agent.text) else agent.size
 

@@ -25,7 +25,7 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.task.pool_opening import PoolOpening
 
-__all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
+__all__ = ["TOLERANCE", "OutputTrajectory", "Replay", "error_of", "substeps_of"]
 
 TOLERANCE: Final = 0.01
 """The error up to which settings are exact enough, as a fraction of how much outputs vary."""
@@ -48,7 +48,7 @@ _silent: Final = logging.Logger("fmugym.validate.settings", logging.CRITICAL + 1
 
 
 @dataclass(frozen=True)
-class Course:
+class OutputTrajectory:
     """What an FMU gave.
 
     Attributes:
@@ -105,7 +105,7 @@ class Replay:
         """The settings of the task."""
         return self.opening.spec
 
-    def run(self, **changes: Any) -> Course | None:
+    def run(self, **changes: Any) -> OutputTrajectory | None:
         """Repeat the episode with other settings.
 
         Args:
@@ -126,7 +126,7 @@ class Replay:
             pool.reset(self.variables, self.starts)
             return None if pool.statuses[0] > WARNING_CODE else self._played(pool)
 
-    def _played(self, pool: Pool) -> Course:
+    def _played(self, pool: Pool) -> OutputTrajectory:
         real = [i for i, one in enumerate(self.spec.outputs) if one.kind == "real"]
         rows = np.full((1 + len(self.inputs), len(real)), np.nan)
         rows[0] = pool.outputs[real, 0]
@@ -139,8 +139,10 @@ class Replay:
                 break
             row[:] = pool.outputs[real, 0]
             if sum(times) > _SECONDS:
-                return Course(rows[: 1 + len(times)], statistics.median(times), is_whole=False)
-        return Course(rows, statistics.median(times))
+                return OutputTrajectory(
+                    rows[: 1 + len(times)], statistics.median(times), is_whole=False
+                )
+        return OutputTrajectory(rows, statistics.median(times))
 
 
 def _untried(fmu: FMU) -> FMU:
@@ -153,7 +155,9 @@ def _untried(fmu: FMU) -> FMU:
     return own
 
 
-def error_of(course: Course | None, reference: Course, steps: int | None = None) -> float:
+def error_of(
+    course: OutputTrajectory | None, reference: OutputTrajectory, steps: int | None = None
+) -> float:
     """The difference of two courses, as a fraction of how much the outputs vary.
 
     It is the root of the mean square over the steps, of the worst output. It is infinite for a
@@ -229,14 +233,14 @@ def substeps_of(replay: Replay) -> Substeps | None:
     return Substeps(needed, errors[own], least, finest, seconds)
 
 
-def _difference(courses: dict[int, Course | None], finest: int, steps: int) -> float:
+def _difference(courses: dict[int, OutputTrajectory | None], finest: int, steps: int) -> float:
     """That of the finest repetition and the one before."""
     reference = courses[finest]
     before = max((n for n in courses if n < finest), default=finest)
     return np.inf if reference is None else error_of(courses[before], reference, steps)
 
 
-def _ladder(replay: Replay) -> Iterator[tuple[int, Course | None]]:
+def _ladder(replay: Replay) -> Iterator[tuple[int, OutputTrajectory | None]]:
     """Courses with 1, 2, 4 ... substeps, until they settle."""
     internal = replay.opening.fmu.description.fixed_internal_step_size or 0.0
     before, count = None, 1

@@ -13,8 +13,8 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import FMUGymError
 from fmugym.linearization import linearize
 from fmugym.pool.spec import FIXED_STEP_SOLVERS
-from fmugym.tools.accuracy import TOLERANCE, Course, Replay, error_of, substeps_of
-from fmugym.tools.findings import Advice, Finding
+from fmugym.tools.accuracy import TOLERANCE, OutputTrajectory, Replay, error_of, substeps_of
+from fmugym.tools.findings import Advice, CheckResult
 from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
 
@@ -44,7 +44,7 @@ _EXACT: Final = 0.1 * TOLERANCE
 """The error that is recommended of solvers, whose tolerances cost little."""
 
 
-def advise(replay: Replay) -> Iterator[Advice | Finding]:
+def advise(replay: Replay) -> Iterator[Advice | CheckResult]:
     """Find settings of the time step, of substeps and of the solver.
 
     Args:
@@ -62,12 +62,12 @@ def advise(replay: Replay) -> Iterator[Advice | Finding]:
         yield from _of_substeps(replay)
 
 
-def _of_substeps(replay: Replay) -> Iterator[Advice | Finding]:
+def _of_substeps(replay: Replay) -> Iterator[Advice | CheckResult]:
     found, own = substeps_of(replay), replay.spec.substeps
     if found is None:
         return
     if found.needed is None:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "accuracy",
             f"with {found.finest} substeps the outputs still differ by {found.least:.2g} of their "
@@ -104,14 +104,14 @@ def _cost(seconds: float, before: float | None) -> str:
     return "" if before is None else f"; a step takes {seconds / before:.2g} times as long"
 
 
-def _of_solvers(replay: Replay) -> Iterator[Advice | Finding]:
+def _of_solvers(replay: Replay) -> Iterator[Advice | CheckResult]:
     """Compare the solvers of model exchange, each with some tolerances."""
     own = replay.run()
     finest = [replay.run(solver=name, tolerance=_FINEST, max_step=None) for name in _SOLVERS]
     known = [one for one in finest if one is not None and one.is_whole]
     least = error_of(known[0], known[1]) if len(known) == len(_SOLVERS) else 0.0
     if least > TOLERANCE:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "accuracy",
             f"the most exact solvers differ by {_share(least)} of the outputs' variation",
@@ -131,7 +131,9 @@ def _of_solvers(replay: Replay) -> Iterator[Advice | Finding]:
         yield from _solver(replay, best, _why(own, error, tried[best]))
 
 
-def _each_solver(replay: Replay, reference: Course) -> Iterator[tuple[tuple[str, float], Course]]:
+def _each_solver(
+    replay: Replay, reference: OutputTrajectory
+) -> Iterator[tuple[tuple[str, float], OutputTrajectory]]:
     """The settings that are exact enough, by solver and tolerance; those of the least cost."""
     for name in _SOLVERS:
         for tolerance in _TOLERANCES:
@@ -141,7 +143,7 @@ def _each_solver(replay: Replay, reference: Course) -> Iterator[tuple[tuple[str,
                 break
 
 
-def _why(own: Course | None, error: float, best: Course) -> str:
+def _why(own: OutputTrajectory | None, error: float, best: OutputTrajectory) -> str:
     if own is None or math.isinf(error):
         return "the solver of this task fails"
     cost = _cost(best.seconds, own.seconds)

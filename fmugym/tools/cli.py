@@ -51,7 +51,7 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``in_wine``: whether its library is one for Windows, which runs in Wine here
 - ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
-  with ``name`` and a ``note``
+  with ``name`` and a ``print_note``
 - ``missing_tool``: the tool that must be installed as well; null if none is known to be missing
 - ``trial``: what the first meeting on this machine has shown: ``deterministic``, the
   ``noisy_outputs``, the grades of ``resets`` by method, the ``reset_method``, the
@@ -89,7 +89,7 @@ from fmugym.tools.fitting import add_fit
 from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_validate
 from fmugym.tools.learning import add_train
-from fmugym.tools.options import add_common, free_outputs, note, speaking
+from fmugym.tools.options import add_common, free_outputs, print_note, speaking
 from fmugym.tools.plants import add_serve
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
 from fmugym.tools.standard_streams import (
@@ -99,7 +99,7 @@ from fmugym.tools.standard_streams import (
     named,
 )
 
-__all__ = ["main"]
+__all__ = ["run_command_line"]
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_tune),
@@ -107,7 +107,7 @@ _COMMANDS: Final = (
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run_command_line(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _code_of(arguments)
         finally:
             if printed is not None and (file := named(printed)):
-                note(f"what FMUs and their libraries printed is in {file}; -v shows it")
+                print_note(f"what FMUs and their libraries printed is in {file}; -v shows it")
 
 
 def _code_of(arguments: argparse.Namespace) -> int:
@@ -143,7 +143,7 @@ def _code_of(arguments: argparse.Namespace) -> int:
         drop_output()
     except (FMUGymError, OSError) as error:
         for line in _told(error).splitlines():  # a task may have several mistakes
-            note(line, "error")
+            print_note(line, "error")
         return 1 if (end := _end_before(error)) is None else exit_code(end)
     return 0
 

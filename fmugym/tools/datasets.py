@@ -12,7 +12,7 @@ from typing import Any, Final
 from fmugym.declared import Task, load
 from fmugym.declared.standard_time import standard_time
 from fmugym.env import FMUEnv
-from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.progress_bars import progress_bar
 from fmugym.episodes.simulation import Player, simulate
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
@@ -158,7 +158,7 @@ def renaming(text: str) -> tuple[str, str]:
 def _played(
     arguments: argparse.Namespace, make_env: Callable[[], FMUEnv], player: Player
 ) -> list[Recording]:
-    with closing(make_env()) as env, progress(None, "dataset") as advance:
+    with closing(make_env()) as env, progress_bar(None, "dataset") as advance:
         recorder, policy = Recorder(env), player.make_policy(env)
         found: list[Recording] = []
         for seed in range(arguments.seed, arguments.seed + arguments.episodes):

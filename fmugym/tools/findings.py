@@ -10,11 +10,11 @@ from typing import Any
 
 from fmugym.errors import plain
 
-__all__ = ["Advice", "Finding", "Report", "lines_of"]
+__all__ = ["Advice", "CheckResult", "ValidationReport", "lines_of"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """The result of a check.
 
     Attributes:
@@ -52,7 +52,7 @@ class Advice:
 
 
 @dataclass(frozen=True)
-class Report:
+class ValidationReport:
     """The results of all checks.
 
     Attributes:
@@ -66,7 +66,7 @@ class Report:
         advices: Lines for the task file, of these settings.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckResult, ...]
     costs: Mapping[str, float | None]
     hooks: str
     reset_method: str

@@ -22,17 +22,17 @@ from fmugym.tools.options import (
     add_command,
     add_json,
     add_task,
-    check_numbers,
+    check_counts,
     say_result,
     tell,
 )
 from fmugym.tools.targets import maker_of, scenarios_of
 from fmugym.tools.watching import watched
-from fmugym.training.agents import FACTS
+from fmugym.training.agents import AGENT_FILE
 from fmugym.training.checkpoints import CHECKPOINT
 from fmugym.training.diary import Diary
 from fmugym.training.environments import fitting_envs
-from fmugym.training.hyperparameters import tune
+from fmugym.training.hyperparameters import tune_hyperparameters
 from fmugym.training.outcome import write_curve, write_outcome
 from fmugym.training.residuals import residual_facts
 from fmugym.training.searching import STATE, Searching
@@ -41,7 +41,7 @@ from fmugym.training.training import (
     TRAINING,
     TrainingSettings,
     Watch,
-    arguments_of,
+    algorithm_arguments,
     facts_of,
     train,
 )
@@ -173,7 +173,7 @@ def _refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> No
 def _search(arguments: argparse.Namespace) -> None:
     given = {name: getattr(arguments, name) for name in _COUNTS}
     counts = {name: value for name, value in given.items() if value is not None}
-    check_numbers(arguments, *counts)
+    check_counts(arguments, *counts)
     if arguments.minutes is not None:
         check_number("--minutes", arguments.minutes, positive=True)
     task, master = arguments.task, arguments.master
@@ -237,7 +237,7 @@ def _learn(arguments: argparse.Namespace) -> None:
 
 def _tell_what_is_kept(folder: Path, state: str) -> None:
     """After Ctrl-C."""
-    if not (folder / FACTS).exists():
+    if not (folder / AGENT_FILE).exists():
         tell("nothing was trained yet")
     elif (folder / state).exists():
         tell(f"{folder} has the best agent until now; --resume goes on with the training")
@@ -255,8 +255,8 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
     make_env = maker_of(arguments.task, master=master)
     if arguments.envs is None:
         arguments.envs = fitting_envs(make_env)
-    check_numbers(arguments, "steps", "envs", "episodes")
-    own = arguments_of(arguments.arguments) or before.get("arguments", {})
+    check_counts(arguments, "steps", "envs", "episodes")
+    own = algorithm_arguments(arguments.arguments) or before.get("arguments", {})
     held_out = {name: maker_of(arguments.task, name, master) for name in names}
     return TrainingSettings(
         make_env,
@@ -301,20 +301,20 @@ def _tuned(settings: TrainingSettings, arguments: argparse.Namespace) -> Trainin
     if arguments.resume:
         raise ConfigError("--tune is for a new training, which --resume is not")
     arguments.tune_steps = arguments.tune_steps or max(1, settings.steps // 10)
-    check_numbers(arguments, "tune", "tune_steps")
+    check_counts(arguments, "tune", "tune_steps")
     with watched(arguments.tune, "tune", "trials") as advance:
 
         def noted(line: str) -> None:
             advance(1)
             tell(line)
 
-        best = tune(settings, arguments.tune, arguments.tune_steps, noted)
+        best = tune_hyperparameters(settings, arguments.tune, arguments.tune_steps, noted)
     tell(f"the best arguments are {json.dumps(best)}")
     return replace(settings, arguments=best)
 
 
 def _show(settings: TrainingSettings, scores: list[Score], arguments: argparse.Namespace) -> None:
-    best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
+    best = json.loads((settings.folder / AGENT_FILE).read_text(encoding="utf-8"))
     told = {"best": best, "scores": [one.as_dict() for one in scores]}
     facts = {"steps": settings.steps, **settings.facts(), **told}
     say_result(arguments, facts, table(scores))

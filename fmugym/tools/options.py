@@ -22,7 +22,7 @@ from fmugym.episodes.progress_bars import quiet
 from fmugym.episodes.simulation import Player, action_of, policy_of
 from fmugym.errors import ConfigError, plain, shown
 from fmugym.systems.system_plan import MASTERS
-from fmugym.training.agents import FACTS, agent_player
+from fmugym.training.agents import AGENT_FILE, agent_player
 
 __all__ = [
     "HELP_OF_TASK",
@@ -35,12 +35,12 @@ __all__ = [
     "add_master",
     "add_players",
     "add_task",
-    "check_numbers",
+    "check_counts",
     "free_outputs",
-    "note",
     "only_player",
     "output_of",
     "players_of",
+    "print_note",
     "require_toml",
     "say",
     "say_json",
@@ -109,7 +109,7 @@ EXAMPLES: Final = {
 }
 """What ``--help`` shows of each command; a test finds these lines in the documents."""
 
-SCHEMA: Final = 1
+_JSON_VERSION: Final = 1
 """Of the JSON; raised when a key goes or changes its meaning. New keys do not raise it."""
 
 
@@ -241,7 +241,7 @@ def output_of(text: str) -> Path | str:
     return text if text.startswith(MINARI) else Path(text)
 
 
-def check_numbers(arguments: argparse.Namespace, *names: str) -> None:
+def check_counts(arguments: argparse.Namespace, *names: str) -> None:
     """Refuse counts below 1 and seeds that are none.
 
     Raises:
@@ -257,7 +257,7 @@ def say(text: str) -> None:
     print(text)
 
 
-def note(text: str, kind: str = "note") -> None:
+def print_note(text: str, kind: str = "note") -> None:
     """Print a line to the error stream."""
     tell(f"fmugym: {kind}: {text}", is_needed=kind == "error")
 
@@ -295,7 +295,7 @@ def speaking(arguments: argparse.Namespace) -> Iterator[None]:
     finally:
         left_out = sum(max(0, count - _OF_ONE_KIND) for count in kinds.values())
         if left_out:
-            note(f"{left_out} more warnings of these kinds; -v shows them")
+            print_note(f"{left_out} more warnings of these kinds; -v shows them")
         quiet.reset(token)
         logger.removeHandler(handler)
         logger.setLevel(level)
@@ -334,7 +334,7 @@ def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
 
 def _is_complete(path: Path, has_failed: bool) -> bool:
     """Whether there is a new file; what is in the folder of a training is complete at any time."""
-    return (path / FACTS).exists() if path.is_dir() else path.exists() and not has_failed
+    return (path / AGENT_FILE).exists() if path.is_dir() else path.exists() and not has_failed
 
 
 def _remove(path: Path) -> None:
@@ -371,7 +371,7 @@ def _outputs_of(arguments: argparse.Namespace) -> Iterator[Path]:
 
 def say_json(facts: dict[str, Any]) -> None:
     """Print one JSON object."""
-    say(json.dumps({"schema": SCHEMA, **facts}, indent=2, default=str))
+    say(json.dumps({"schema": _JSON_VERSION, **facts}, indent=2, default=str))
 
 
 def say_result(arguments: argparse.Namespace, facts: Mapping[str, Any], text: str) -> None:
@@ -427,4 +427,4 @@ def write_text(text: str, output: Path | None, notes: Iterable[str]) -> None:
     else:
         write_new(output, text)
     for one in notes:
-        note(one)
+        print_note(one)

@@ -19,7 +19,7 @@ from fmugym.errors import FMULoadError, first_of, plain
 from fmugym.series.choice import matches
 from fmugym.trial.known import known_verdict
 
-__all__ = ["as_text", "finite_or_none", "headed", "overview", "start_value", "tables"]
+__all__ = ["as_text", "finite_or_none", "headed", "overview", "tables", "typed_start"]
 
 SHOWN: Final = ("input", "output", "parameter")
 """The causalities that are listed by default."""
@@ -131,7 +131,7 @@ def _row(variable: Variable) -> dict[str, Any]:
         "shape": list(variable.shape),
         "min": finite_or_none(variable.minimum),
         "max": finite_or_none(variable.maximum),
-        "start": start_value(variable),
+        "start": typed_start(variable),
         "items": [{"name": name, "value": value} for name, value in variable.items],
     }
 
@@ -141,7 +141,7 @@ def finite_or_none(number: float) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def start_value(variable: Variable) -> bool | int | float | str | None:
+def typed_start(variable: Variable) -> bool | int | float | str | None:
     """Convert the start value, which the XML has as text, to the variable's type.
 
     Returns:

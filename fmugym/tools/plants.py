@@ -13,8 +13,8 @@ from typing import Any, Final
 from fmugym.checks import check_count, check_number, duration
 from fmugym.declared import Task
 from fmugym.declared.writing import as_toml
-from fmugym.episodes.output_files import Recording
-from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.output_files import EpisodeFiles
+from fmugym.episodes.progress_bars import progress_bar
 from fmugym.episodes.simulation import Summary, simulate
 from fmugym.errors import ConfigError, plain, shown
 from fmugym.plant import Server, connect
@@ -26,14 +26,14 @@ from fmugym.tools.options import (
     add_command,
     add_json,
     add_players,
-    check_numbers,
+    check_counts,
     only_player,
     say,
     say_result,
     shown_in_any_case,
 )
 
-__all__ = ["add_of_plants", "add_serve", "follow_plant", "task_of"]
+__all__ = ["add_of_plants", "add_serve", "follow_plant", "plant_task"]
 
 _AHEAD: Final = "3h"
 
@@ -57,7 +57,7 @@ def _clock(arguments: argparse.Namespace) -> RealClock:
     return RealClock(check_number("--speed", arguments.speed, positive=True))
 
 
-def task_of(arguments: argparse.Namespace) -> Task:
+def plant_task(arguments: argparse.Namespace) -> Task:
     """Read the task of a plant.
 
     Raises:
@@ -75,9 +75,13 @@ def follow_plant(arguments: argparse.Namespace) -> None:
     player = only_player(arguments)
     ahead = duration("--ahead", arguments.ahead)
     make_env: Any = partial(
-        connect, task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
+        connect,
+        plant_task(arguments),
+        arguments.plant or None,
+        ahead=ahead,
+        clock=_clock(arguments),
     )
-    recording, done = Recording(arguments.task, None, arguments.output), list[Summary]()
+    recording, done = EpisodeFiles(arguments.task, None, arguments.output), list[Summary]()
     with closing(player.make_env(make_env)) as env:
         shadow: Any = env
         played = shadow
@@ -87,7 +91,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
         with (
             shown_in_any_case(lambda: _show(arguments, done, shadow.errors())),
             recording.finished(arguments.seed),
-            progress(arguments.steps, "shadow") as advance,
+            progress_bar(arguments.steps, "shadow") as advance,
         ):
             while (left := arguments.steps - sum(one.steps for one in done)) > 0:
                 done.append(simulate(played, policy, arguments.seed, left, advance))
@@ -134,10 +138,10 @@ def add_serve(commands: Commands) -> None:
 
 
 def _serve(arguments: argparse.Namespace) -> None:
-    check_numbers(arguments)
+    check_counts(arguments)
     steps = arguments.steps if arguments.steps is None else check_count("--steps", arguments.steps)
     options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
-    task, player = task_of(arguments), only_player(arguments)
+    task, player = plant_task(arguments), only_player(arguments)
     has_plant = "plant" in task.document
     if arguments.protocol is not None:
         task = with_plant(task, arguments.protocol)

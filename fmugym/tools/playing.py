@@ -13,7 +13,7 @@ from fmugym.baselines.arena import most_steps_of
 from fmugym.checks import Spellings
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
-from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
+from fmugym.episodes.output_files import EpisodeFiles, require_format, require_picture, title_of
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import ConfigError, plain, reason
 from fmugym.tools.datasets import (
@@ -30,7 +30,7 @@ from fmugym.tools.options import (
     add_json,
     add_players,
     add_task,
-    check_numbers,
+    check_counts,
     output_of,
     players_of,
     say,
@@ -39,9 +39,9 @@ from fmugym.tools.options import (
     shown_in_any_case,
     tell,
 )
-from fmugym.tools.plants import add_of_plants, follow_plant, task_of
+from fmugym.tools.plants import add_of_plants, follow_plant, plant_task
 from fmugym.tools.shadows import evaluate_log
-from fmugym.tools.speed import Report, bench, speed_table
+from fmugym.tools.speed import SpeedReport, bench, speed_table
 from fmugym.tools.targets import maker_of, player_maker, scenarios_of
 from fmugym.tools.watching import watched
 
@@ -75,7 +75,7 @@ def add_simulate(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    check_numbers(arguments, "episodes", "steps")
+    check_counts(arguments, "episodes", "steps")
     if dataset_of(arguments) is not None:
         make_dataset(arguments)
         return 0
@@ -87,7 +87,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     players = players_of(arguments)
     for path in arguments.output:
         require_format(path, len(players))
-    recording = Recording(arguments.task, arguments.scenario, arguments.output)
+    recording = EpisodeFiles(arguments.task, arguments.scenario, arguments.output)
     runs: dict[str, list[Summary]] = {name: [] for name in players}
 
     def show() -> None:
@@ -117,7 +117,7 @@ def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
 
 def _play(
     arguments: argparse.Namespace,
-    recording: Recording,
+    recording: EpisodeFiles,
     name: str,
     player: Player,
     runs: dict[str, list[Summary]],
@@ -170,7 +170,7 @@ def add_evaluate(commands: Commands) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    check_numbers(arguments, "episodes", "steps")
+    check_counts(arguments, "episodes", "steps")
     if arguments.plot is not None:
         require_picture(arguments.plot)
     if arguments.log is not None and arguments.scenario:
@@ -187,7 +187,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         if arguments.log is not None:
-            task, log = task_of(arguments), read_log(arguments.log, arguments)
+            task, log = plant_task(arguments), read_log(arguments.log, arguments)
             with watched(1.0, "evaluate") as advance:
                 scores.extend(evaluate_log(task, log, players, advance, leave_out))
         else:
@@ -286,7 +286,7 @@ def add_bench(commands: Commands) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    reports: list[Report] = []
+    reports: list[SpeedReport] = []
 
     def show() -> None:
         for last in reports[-1:]:  # which has the speeds of those before

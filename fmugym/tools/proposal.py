@@ -21,7 +21,7 @@ from fmugym.declared.declarations import is_reserved
 from fmugym.declared.likely_units import likely_units
 from fmugym.errors import ConfigError, plain
 from fmugym.systems.system_description import SystemDescription
-from fmugym.tools.overview import start_value
+from fmugym.tools.overview import typed_start
 from fmugym.tools.skeleton import (
     END_OF_EXPERIMENT,
     Skeleton,
@@ -357,7 +357,7 @@ def _unlikeliness(variable: Variable) -> tuple[bool, ...]:
 
 def _ends_of_setpoint(variable: Variable) -> tuple[float, float]:
     """Values near the start of a temperature, or in the middle of the range of another output."""
-    start = start_value(variable) or variable.nominal or _ROOM.get(variable.unit or "")
+    start = typed_start(variable) or variable.nominal or _ROOM.get(variable.unit or "")
     if variable.unit in _TEMPERATURES and isinstance(start, int | float):
         return start - _DEGREES, start + _DEGREES
     low, high = guessed_bounds(variable)

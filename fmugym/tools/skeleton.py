@@ -23,7 +23,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMULoadError, plain
 from fmugym.repair.stand_in import replaceable
 from fmugym.systems.system_description import SystemDescription
-from fmugym.tools.overview import start_value
+from fmugym.tools.overview import typed_start
 
 __all__ = [
     "END_OF_EXPERIMENT",
@@ -42,16 +42,16 @@ MOST_PARAMETERS: Final = 40
 DEFAULT_STEP: Final = 0.01
 """The step size in seconds where the FMU tells nothing about its time."""
 
-MOST_ELEMENTS: Final = 100
+_MOST_ELEMENTS: Final = 100
 """Larger arrays are left out."""
 
 MOST_LOCALS: Final = 8
 """Locals that replace outputs where the FMU has none."""
 
-STEPS: Final = 500
+_EPISODE_STEPS: Final = 500
 """About as many steps has the default experiment where the FMU gives no usable step size."""
 
-MOST_STEPS: Final = 100_000
+_MOST_STEPS: Final = 100_000
 """More steps than this are no episode."""
 
 _SOLVER: Final = re.compile(
@@ -299,7 +299,7 @@ class Skeleton:
     @property
     def has_duration(self) -> bool:
         """Whether an episode takes as long as the FMU's default experiment."""
-        return 1 <= self._duration / self.time_step <= MOST_STEPS
+        return 1 <= self._duration / self.time_step <= _MOST_STEPS
 
     @property
     def has_step_size(self) -> bool:
@@ -314,8 +314,8 @@ class Skeleton:
         if not 0.0 < self._duration < math.inf:
             return internal or DEFAULT_STEP
         if internal:
-            return internal * max(1, round(self._duration / STEPS / internal))
-        return rounded_down(self._duration / STEPS)
+            return internal * max(1, round(self._duration / _EPISODE_STEPS / internal))
+        return rounded_down(self._duration / _EPISODE_STEPS)
 
 
 def old_libraries(fmu: FMU) -> tuple[str, ...]:
@@ -361,7 +361,7 @@ def guessed_bounds(variable: Variable) -> tuple[float, float]:
 
 
 def _start(variable: Variable) -> float:
-    value = start_value(variable)
+    value = typed_start(variable)
     return float(value) if isinstance(value, int | float) else 0.0
 
 
@@ -389,7 +389,7 @@ def rounded_down(value: float) -> float:
 
 def _scalars(variables: Sequence[Variable]) -> list[Variable]:
     """The numeric scalars, and the elements of numeric arrays that are not large."""
-    usable = (v for v in variables if v.is_number and v.size <= MOST_ELEMENTS)
+    usable = (v for v in variables if v.is_number and v.size <= _MOST_ELEMENTS)
     # something else drives elements of another causality
     return [one for v in usable for one in v.elements if one.causality == v.causality]
 
@@ -404,7 +404,7 @@ def given_start(variable: Variable) -> Any:
     """The start value as the config takes it; None if the config takes none."""
     if variable.shape and variable.is_number and variable.start is not None:
         return _array_start(variable)
-    value = start_value(variable)
+    value = typed_start(variable)
     if variable.kind == "string" and not variable.shape:
         return value
     if not variable.numeric or isinstance(value, str):
@@ -416,7 +416,7 @@ def given_start(variable: Variable) -> Any:
 def _array_start(variable: Variable) -> Any:
     """Nested lists of the start values; None if they are many, or are malformed."""
     with suppress(ConfigError):
-        if 0 < variable.size <= MOST_ELEMENTS:
+        if 0 < variable.size <= _MOST_ELEMENTS:
             return np.reshape(variable.start_numbers, variable.shape).tolist()
     return None
 

@@ -17,7 +17,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["Report", "Speed", "bench", "speed_table"]
+__all__ = ["Speed", "SpeedReport", "bench", "speed_table"]
 
 _ROUNDS: Final = 5
 """A measurement is the fastest of so many: what else the machine does only makes it slower."""
@@ -49,7 +49,7 @@ class Speed:
 
 
 @dataclass(frozen=True)
-class Report:
+class SpeedReport:
     """The result of a measurement.
 
     Attributes:
@@ -65,7 +65,9 @@ class Report:
     load: float | None
 
 
-def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) -> Iterator[Report]:
+def bench(
+    make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float
+) -> Iterator[SpeedReport]:
     """Measure the speed of a task with random actions.
 
     Args:
@@ -85,7 +87,7 @@ def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) 
     load: float | None = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with closing(make_env()) as env:
         time_step = env.inside.spec.time_step
-        report = Report((_of_single(env, seconds),), time_step, _processors(), load)
+        report = SpeedReport((_of_single(env, seconds),), time_step, _processors(), load)
     yield report
     for size in sizes:
         report = replace(report, speeds=(*report.speeds, _of_vector(make_env, size, seconds)))
@@ -172,7 +174,7 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     return min(1.0, best / took)
 
 
-def speed_table(report: Report) -> str:
+def speed_table(report: SpeedReport) -> str:
     """Format speeds for a terminal."""
     header = ("environments", "hooks", "steps/s", "us per call", "FMU's share", "x real time")
     rows = [header, *(_row(speed, report.time_step) for speed in report.speeds)]

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from time import monotonic
 from typing import Final
 
-from fmugym.episodes.progress_bars import Advance, no_progress, progress
+from fmugym.episodes.progress_bars import Advance, no_progress, progress_bar
 from fmugym.tools.options import tell
 
 __all__ = ["watched"]
@@ -32,7 +32,7 @@ def watched(
     Yields:
         A function that is told what was done since the last call, and perhaps a text to show.
     """
-    with progress(total, what, unit) as advance:
+    with progress_bar(total, what, unit) as advance:
         yield advance if advance is not no_progress else _lines(total, what, clock or monotonic)
 
 

@@ -23,12 +23,12 @@ from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.extras import imported
 from fmugym.files import replaced_together
 from fmugym.scaling import are_scaled, unscaled
-from fmugym.search.policy import AGENT, Agent, require_task
+from fmugym.search.policy import POLICY_FILE, ResidualAgent, require_task
 from fmugym.search.residual import Residual
 from fmugym.training.residuals import residual_of
 
 __all__ = [
-    "FACTS",
+    "AGENT_FILE",
     "agent_player",
     "algorithm_of",
     "imported_for_training",
@@ -42,7 +42,7 @@ __all__ = [
 
 _LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
 _MODEL, _NORMALIZATION = "model.zip", "normalization.pkl"
-FACTS: Final = "agent.json"
+AGENT_FILE: Final = "agent.json"
 
 
 def imported_for_training(name: str) -> Any:
@@ -84,7 +84,7 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
         model.save(beside(folder / _MODEL))
         if normalization is not None:
             normalization.save(str(beside(folder / _NORMALIZATION)))
-        beside(folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
+        beside(folder / AGENT_FILE).write_text(json.dumps(dict(facts)), encoding="utf-8")
 
 
 def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
@@ -104,7 +104,7 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
     """
     path = check_path("folder", folder)
     model, normalization = read_agent(path)
-    if isinstance(model, Agent):
+    if isinstance(model, ResidualAgent):
         return model.policy()
     if isinstance(model, Residual):
         return model
@@ -185,8 +185,8 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
-    if (path / AGENT).exists():
-        return Agent.load(path), None
+    if (path / POLICY_FILE).exists():
+        return ResidualAgent.load(path), None
     file = path if path.is_file() else path / _MODEL
     facts: dict[str, Any] = {"algorithm": algorithm} if path.is_file() else _facts_in(path)
     kind = algorithm_of(facts["algorithm"])
@@ -200,7 +200,7 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
 
 
 def _facts_in(folder: Path) -> dict[str, Any]:
-    return read_facts(folder, FACTS, "is no folder of 'fmugym train'", "algorithm")
+    return read_facts(folder, AGENT_FILE, "is no folder of 'fmugym train'", "algorithm")
 
 
 def read_facts(folder: Path, name: str, what_is_wrong: str, *needed: str) -> dict[str, Any]:

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, Outcome
+from fmugym.baselines.arena import Arena, ArenaResult
 from fmugym.episodes.evaluation import HELD_OUT_SEED
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.series.intervals import confidence
 
 __all__ = ["judge", "verdict"]
 
 
 def judge(
-    agents: Mapping[str, Agent],
+    agents: Mapping[str, ResidualAgent],
     arenas: Mapping[str, Arena],
     episodes: int,
     leave_out: Callable[[str, Exception], None],
@@ -39,7 +39,7 @@ def judge(
         ``mean_costs`` by name, with the part of ``failed episodes``, which a fault has cut short.
     """
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes)
-    played: dict[str, list[Outcome]] = {name: [] for name in agents}
+    played: dict[str, list[ArenaResult]] = {name: [] for name in agents}
     opened = []
     for scenario, arena in arenas.items():
         with closing(arena):
@@ -60,7 +60,7 @@ def judge(
     return _told(played if opened else {}, opened)
 
 
-def _told(played: Mapping[str, Sequence[Outcome]], scenarios: Sequence[str]) -> dict[str, Any]:
+def _told(played: Mapping[str, Sequence[ArenaResult]], scenarios: Sequence[str]) -> dict[str, Any]:
     test = {}
     for name, outcomes in played.items():
         costs = np.mean([one.costs for one in outcomes], axis=(0, 1, 2)).tolist()

@@ -18,7 +18,16 @@ from fmugym.series import RecordSeries, RecordVectorSeries
 from fmugym.series.plots import COLOURS, drawing_style
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve", "note"]
+__all__ = [
+    "CURVE",
+    "EVALUATIONS",
+    "RECORDS",
+    "REPORT",
+    "Diary",
+    "append_row",
+    "curve_of",
+    "draw_curve",
+]
 
 EVALUATIONS: Final = "evaluations.csv"
 CURVE: Final = "evaluations.png"
@@ -101,7 +110,9 @@ class Diary:
         return wrap
 
 
-def note(folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVALUATIONS) -> None:
+def append_row(
+    folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVALUATIONS
+) -> None:
     """Add a row to a table of a training, which is made if there is none.
 
     Args:

@@ -13,10 +13,10 @@ from typing import Any, Final
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
 from fmugym.training.agents import algorithm_of
-from fmugym.training.diary import note
+from fmugym.training.diary import append_row
 from fmugym.training.training import TRIALS, TrainingSettings, Watch, require_new, train
 
-__all__ = ["tune"]
+__all__ = ["tune_hyperparameters"]
 
 _FACTORS: Final = (0.25, 0.5, 1, 2, 4)
 _COUNTS: Final = ("n_steps", "batch_size", "n_epochs", "train_freq")
@@ -37,7 +37,7 @@ _PARTS: Final = 4
 """A trial has at least so many updates."""
 
 
-def tune(
+def tune_hyperparameters(
     settings: TrainingSettings, trials: int, steps: int, tell: Callable[[str], None]
 ) -> dict[str, Any]:
     """Try arguments of the algorithm in short trainings.
@@ -146,4 +146,4 @@ def _note(settings: TrainingSettings, trial: Any) -> None:
     arguments = json.dumps(trial.user_attrs.get("arguments", {}))
     row = [trial.number, trial.state.name.lower(), trial.value, arguments]
     settings.folder.mkdir(parents=True, exist_ok=True)
-    note(settings.folder, ("trial", "state", "reward", "arguments"), row, f"{TRIALS}.csv")
+    append_row(settings.folder, ("trial", "state", "reward", "arguments"), row, f"{TRIALS}.csv")

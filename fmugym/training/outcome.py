@@ -16,7 +16,7 @@ from fmugym.errors import ConfigError
 from fmugym.files import replaced
 from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.plots import svg_of
-from fmugym.training.agents import FACTS, agent_player
+from fmugym.training.agents import AGENT_FILE, agent_player
 from fmugym.training.diary import CURVE, REPORT, Diary, curve_of, draw_curve
 from fmugym.training.training import TrainingSettings
 
@@ -70,7 +70,7 @@ def _write_report(
     }
     with closing(settings.make_env()) as env:
         about = About.of(env)
-    best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
+    best = json.loads((settings.folder / AGENT_FILE).read_text(encoding="utf-8"))
     facts = {
         "algorithm": settings.algorithm,
         "arguments": ", ".join(f"{k} = {v}" for k, v in (settings.arguments or {}).items())

@@ -22,14 +22,14 @@ from fmugym.errors import ConfigError, reading_file, reason, shown
 from fmugym.files import replaced_together
 from fmugym.pool.processors import available_processors
 from fmugym.search.guessing import MOST_TESTED
-from fmugym.search.policy import AGENT, Agent
-from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
+from fmugym.search.policy import POLICY_FILE, ResidualAgent
+from fmugym.search.probe import FEW, MOST_PROBED, Probe, agent_task
 from fmugym.search.search import Search
 from fmugym.search.search_file import bytes_of, plain_of, search_in
 from fmugym.surrogate.courses import Courses
-from fmugym.training.agents import FACTS
+from fmugym.training.agents import AGENT_FILE
 from fmugym.training.comparing import judge, verdict
-from fmugym.training.diary import note
+from fmugym.training.diary import append_row
 from fmugym.training.environments import VERY_SLOW
 from fmugym.training.training import require_new
 from fmugym.training.twin import TwinSearch
@@ -172,7 +172,7 @@ class Searching:
         with reading_file(f"{name} has no search to resume"):
             found = search_in((self.folder / STATE).read_bytes())
         with closing(self.make_env()) as env:
-            before, now = plain_of(found.probe.task), plain_of(task_of(env))
+            before, now = plain_of(found.probe.task), plain_of(agent_task(env))
         changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
         if changed:
             raise ConfigError(
@@ -224,7 +224,7 @@ class Searching:
         with closing(self.make_env()) as env:
             return env.inside.opening.backend is None
 
-    def _winner(self) -> Agent:
+    def _winner(self) -> ResidualAgent:
         """Search, and find the winner of the last validation.
 
         What was found is written also if an exception ends the search.
@@ -251,7 +251,7 @@ class Searching:
         self._save(winner)
         return winner
 
-    def _proved(self) -> Agent:
+    def _proved(self) -> ResidualAgent:
         """Search on a surrogate of the FMU, and find the agent that is best on the FMU.
 
         What was found is written also if an exception ends the search.
@@ -296,7 +296,7 @@ class Searching:
             ahead, base = found.ahead, found.baseline
             if base and (before.baseline is None or ahead.merit > before.ahead.merit):
                 row = self._arena.steps, ahead.merit[1], base.merit[1]
-                note(self.folder, ("steps", "reward", "baseline"), row)
+                append_row(self.folder, ("steps", "reward", "baseline"), row)
                 self._save(ahead.best)
             took = monotonic() - begin
             longest = max(longest, took)
@@ -325,7 +325,7 @@ class Searching:
         text += f", best {ahead.merit[1]:.6g}" if ahead.merit > NO_MERIT else ""
         return text + (f", {base.best.name} {base.merit[1]:.6g}" if base else "")
 
-    def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
+    def _save(self, agent: ResidualAgent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
         found, task = self._found, self._probe.task
         found.steps = self._arena.steps
@@ -342,13 +342,13 @@ class Searching:
         }
         named = replace(agent, names=task["observations"], actions=task["actions"])
         with replaced_together() as beside:
-            beside(self.folder / AGENT).write_bytes(named.content())
+            beside(self.folder / POLICY_FILE).write_bytes(named.content())
             if not self._on_surrogate:  # whose search cannot be resumed
                 beside(self.folder / STATE).write_bytes(bytes_of(found))
-            beside(self.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
+            beside(self.folder / AGENT_FILE).write_text(json.dumps(facts), encoding="utf-8")
         return facts
 
-    def _judged(self, winner: Agent) -> dict[str, Any]:
+    def _judged(self, winner: ResidualAgent) -> dict[str, Any]:
         """Let the winner play beside the others, and write what it has reached."""
         probe, found = self._probe, self._found
         baseline = found.baseline.best if found.baseline else winner
@@ -375,7 +375,7 @@ class Searching:
         return self._save(winner, test=test, verdict=text)
 
     def _test(
-        self, agents: Mapping[str, Agent], arenas: Mapping[str, Arena], count: int
+        self, agents: Mapping[str, ResidualAgent], arenas: Mapping[str, Arena], count: int
     ) -> dict[str, Any]:
         """Let agents play, and show how far they are; nothing that one does ends the test."""
         usual = self._probe.seconds * self._probe.usual_steps * count * len(arenas)
@@ -392,7 +392,7 @@ class Searching:
     def _leave_out(self, name: str, error: Exception) -> None:
         self.tell(f"left out: {name}: {reason(error)}")
 
-    def _planners(self, baseline: str | None, episodes: int) -> Iterator[Agent]:
+    def _planners(self, baseline: str | None, episodes: int) -> Iterator[ResidualAgent]:
         """The controllers that plan ahead and whose test takes no longer than the search.
 
         They begin with the plan of the baseline.
@@ -405,7 +405,7 @@ class Searching:
             if not plans_ahead(text):
                 continue
             try:
-                agent = Agent(name, warmed(text, baseline))
+                agent = ResidualAgent(name, warmed(text, baseline))
                 with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
                     agent.play(arena, range(1))
             except Exception as error:

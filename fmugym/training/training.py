@@ -32,7 +32,7 @@ from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.files import write_whole
 from fmugym.scaling import can_be_scaled
 from fmugym.training.agents import (
-    FACTS,
+    AGENT_FILE,
     agent_player,
     algorithm_of,
     imported_for_training,
@@ -47,7 +47,7 @@ from fmugym.training.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, note
+from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, append_row
 from fmugym.training.residuals import begin_at_zero, residual_of
 from fmugym.training.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
@@ -57,7 +57,7 @@ __all__ = [
     "TRIALS",
     "TrainingSettings",
     "Watch",
-    "arguments_of",
+    "algorithm_arguments",
     "facts_of",
     "require_new",
     "train",
@@ -122,7 +122,7 @@ class TrainingSettings:
         return self.make_env if self.residual is None else partial(self.make_env, physical=True)
 
 
-def arguments_of(texts: Iterable[str]) -> dict[str, Any]:
+def algorithm_arguments(texts: Iterable[str]) -> dict[str, Any]:
     """Read arguments of an algorithm, ``key=value`` with values as in TOML.
 
     A value that is none of TOML is taken as text: ``policy=MlpPolicy``.
@@ -360,7 +360,9 @@ class _Training:
             else:
                 self.evaluate()
         except KeyboardInterrupt:
-            if not (self._settings.folder / FACTS).exists():  # a second one may end the evaluation
+            if not (
+                self._settings.folder / AGENT_FILE
+            ).exists():  # a second one may end the evaluation
                 self._keep()
             self.evaluate()
             raise
@@ -463,7 +465,7 @@ class _Training:
 
     def scores_of_kept(self) -> list[Score]:
         """Let the agent in the folder play the episodes of the evaluations once more."""
-        facts = json.loads((self._settings.folder / FACTS).read_text(encoding="utf-8"))
+        facts = json.loads((self._settings.folder / AGENT_FILE).read_text(encoding="utf-8"))
         self._watch.tell(f"the agent after {facts['steps']} steps was the best, and is kept")
         return self._scores(agent_player(self._settings.folder), lambda name: lambda env: env)
 
@@ -490,7 +492,7 @@ class _Training:
 
     def _note(self, steps: int, mean: float, scores: list[Score]) -> None:
         names = ["steps", "reward", *(score.name for score in scores)]
-        note(self._settings.folder, names, [steps, mean, *(score.mean for score in scores)])
+        append_row(self._settings.folder, names, [steps, mean, *(score.mean for score in scores)])
         if self._tracker is not None:
             each = {f"evaluation/{score.name}": score.mean for score in scores}
             self._tracker.log({"evaluation/reward": mean, **each}, steps)

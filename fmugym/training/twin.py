@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Final, NamedTuple
 
-from fmugym.baselines.arena import Arena, Merit, Outcome
+from fmugym.baselines.arena import Arena, ArenaResult, Merit
 from fmugym.errors import ConfigError
 from fmugym.search.excitation import excite
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.search.search import VALIDATION, Search
 from fmugym.surrogate.courses import Courses
 from fmugym.surrogate.surrogate import Surrogate
@@ -60,9 +60,9 @@ class Proof(NamedTuple):
         measured: What it has reached there.
     """
 
-    agent: Agent
+    agent: ResidualAgent
     seeds: Sequence[int]
-    measured: Outcome
+    measured: ArenaResult
 
 
 class Standing(NamedTuple):
@@ -102,7 +102,7 @@ class TwinSearch:
     tell: Callable[[str], None]
     advance: Callable[[float, str], None]
     proofs: list[Proof] = field(default_factory=list)
-    best: Agent | None = None
+    best: ResidualAgent | None = None
 
     def __post_init__(self) -> None:
         self._end = monotonic() + self.seconds
@@ -110,7 +110,7 @@ class TwinSearch:
         self.length = int(min(most, max(left // _DIVIDED, min(most / 2, left // _FEWEST_PLAYED))))
         self.arena.most_steps = self.length
 
-    def winner(self) -> Agent:
+    def winner(self) -> ResidualAgent:
         """The best agent.
 
         Raises:

@@ -7,7 +7,7 @@ import pytest
 
 import fmugym
 from fmugym.baselines import PID, Constant, Controller, Hysteresis, tune
-from fmugym.baselines.arena import Outcome
+from fmugym.baselines.arena import ArenaResult
 from fmugym.baselines.tuning import entrant_of
 from fmugym.envs import HouseEnv
 from fmugym.linearization import linearize
@@ -199,7 +199,7 @@ class Deceptive:
         wide, narrow = (np.linalg.norm(places - top, axis=1) for top in (0.5, 0.85))
         returns = np.maximum(0.5 - wide, 1.0 - 3.0 * narrow)[:, None]
         nothing = np.zeros((*returns.shape, 1))
-        return Outcome(returns, nothing, {}, nothing)
+        return ArenaResult(returns, nothing, {}, nothing)
 
 
 def test_it_looks_everywhere_at_first():

@@ -12,7 +12,7 @@ import fmugym
 from fmugym.baselines import MPC
 from fmugym.baselines.arena import Arena
 from fmugym.baselines.table_texts import table_in
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.tools import watching
 from fmugym.training import searching
 from fmugym.training.comparing import judge, verdict
@@ -112,10 +112,10 @@ class TestTrain:
                 return real(agent, arena, seeds)
             raise error("it has failed")
 
-        real, judged = Agent.play, searching.judge
+        real, judged = ResidualAgent.play, searching.judge
 
         def judge(*arguments):
-            monkeypatch.setattr(Agent, "play", play)
+            monkeypatch.setattr(ResidualAgent, "play", play)
             return judged(*arguments)
 
         monkeypatch.setattr(searching, "judge", judge)
@@ -135,7 +135,7 @@ class TestTrain:
             raise fmugym.ConfigError("there is no weather")
 
         make = lambda: fmugym.load(fmugym.Task.from_dict(ONE))  # noqa: E731
-        agents = {name: Agent(name, f"schedule 00:00={name}") for name in ("0.05", "0")}
+        agents = {name: ResidualAgent(name, f"schedule 00:00={name}") for name in ("0.05", "0")}
         told, parts = [], []
         found = judge(
             agents,
@@ -256,6 +256,6 @@ def test_groups_are_parts_of_a_whole():
     parts = []
     arena = Arena(lambda: fmugym.load(fmugym.Task.from_dict(ONE)), 4, advance=parts.append)
     numbers = np.zeros((3, 1))
-    arena.play(lambda rows: Agent("0", "schedule 00:00=0")(rows[:, :0]), numbers, range(10))
+    arena.play(lambda rows: ResidualAgent("0", "schedule 00:00=0")(rows[:, :0]), numbers, range(10))
     arena.close()
     assert sum(parts) == pytest.approx(1.0)
