@@ -29,8 +29,8 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
 from fmugym.identification.problem import start_between
-from fmugym.identification.simulator import Experiment, median_interval, silent
-from fmugym.logs import Columns, PlantLog, declared_as
+from fmugym.identification.simulator import FitSettings, median_interval, silent
+from fmugym.logs import LogColumns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
 from fmugym.task.starting import start_variable
 
@@ -98,7 +98,7 @@ def fit_logs(
         if wash_in is None:
             shortest = min(float(np.ptp(one.time)) for one in trajectories)
             wash_in = 0.0 if states else _WASH_IN * shortest
-        experiment = Experiment(
+        experiment = FitSettings(
             plant.env.fmu,
             initial_states=states,
             fixed={n: v for n, v in plant.given.items() if n not in wanted | states},
@@ -138,7 +138,7 @@ class _Plant:
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:
         """The episodes of a log, in the units of the FMU; what was not measured parts them."""
-        spec, columns = self.env.inside.spec, Columns(self.env, log, self._columns)
+        spec, columns = self.env.inside.spec, LogColumns(self.env, log, self._columns)
         for variable in spec.inputs:
             columns.require(variable)
         measured = [variable for variable in spec.outputs if columns.has(variable)]

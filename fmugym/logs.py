@@ -47,7 +47,7 @@ from fmugym.task.actions import flat_inputs
 
 __all__ = [
     "Actions",
-    "Columns",
+    "LogColumns",
     "PlantLog",
     "as_logged",
     "declared_as",
@@ -340,7 +340,7 @@ class _Player:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
         self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
         self._needed = *inner.inside.spec.outputs, *inner.inside.spec.inputs
-        self._columns = Columns(inner, log, columns)
+        self._columns = LogColumns(inner, log, columns)
         for variable in inner.inside.spec.outputs:
             self._columns.require(variable)
         self._actions = Actions(inner, self._columns.range_of, tolerance)
@@ -433,7 +433,7 @@ def _section(env: FMUEnv, key: str) -> Mapping[str, Any]:
     return section
 
 
-class Columns:
+class LogColumns:
     """The columns of a log as variables of an FMU, in the units of the FMU."""
 
     def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:

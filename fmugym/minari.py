@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
-from fmugym.recording import FACTS, Recording, element_from, flat_element
+from fmugym.recording import METADATA, Recording, element_from, flat_element
 from fmugym.task.snapshot import require_scope, scope_of
 
 try:
@@ -113,7 +113,7 @@ def _loaded(name: str) -> minari.MinariDataset:
 
 
 def _buffer(number: int, recording: Recording, env: FMUEnv) -> EpisodeBuffer:
-    facts = {name: getattr(recording, name) for name in FACTS}
+    facts = {name: getattr(recording, name) for name in METADATA}
     return EpisodeBuffer(
         id=number,
         seed=recording.seed,

@@ -40,10 +40,10 @@ from fmugym.task.snapshot import require_scope, scope_of
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
 
 __all__ = [
-    "FACTS",
+    "METADATA",
     "Recorder",
     "Recording",
-    "Report",
+    "ReplayReport",
     "element_from",
     "flat_element",
     "replay",
@@ -118,7 +118,7 @@ class Recording:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the recording to a file, in the format ``npz`` of numpy."""
         fields = {name: getattr(self, name) for name in _ARRAYS}
-        header = {name: getattr(self, name) for name in FACTS}
+        header = {name: getattr(self, name) for name in METADATA}
         text = json.dumps({"version": _VERSION, **header}).encode()
         with replaced(Path(path)) as part, part.open("wb") as file:
             np.savez_compressed(file, header=np.frombuffer(text, np.uint8), **fields)
@@ -143,7 +143,7 @@ class Recording:
             ) from None
 
 
-FACTS: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
+METADATA: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
 """What a recording holds besides arrays."""
 
 _ARRAYS: Final = {
@@ -247,7 +247,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 @dataclass(frozen=True)
-class Report:
+class ReplayReport:
     """What a replay has shown.
 
     Attributes:
@@ -273,7 +273,7 @@ class Report:
         return f"{self.steps} steps were replayed: {told}{f' ({others})' if others else ''}"
 
 
-def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
+def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> ReplayReport:
     """Play a recorded episode again, and compare it to the last bit.
 
     Args:
@@ -297,7 +297,7 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
     while not found and steps < len(recording):
         found = _difference_of_step(recording, env, steps)
         steps += 1
-    return Report(steps, found, others)
+    return ReplayReport(steps, found, others)
 
 
 def _difference_of_starts(

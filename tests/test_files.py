@@ -175,7 +175,7 @@ def test_a_recording(tmp_path):
     recording = SimpleNamespace(
         **dict.fromkeys(fmugym.recording._ARRAYS, np.random.default_rng(0).random(2000))
     )
-    vars(recording).update(dict.fromkeys(fmugym.recording.FACTS))
+    vars(recording).update(dict.fromkeys(fmugym.recording.METADATA))
     save = fmugym.recording.Recording.save
     unchanged(tmp_path, lambda: save(recording, tmp_path / "episode.npz"))
 

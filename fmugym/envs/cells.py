@@ -19,7 +19,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool import Paced
 from fmugym.pool.backend.clocks import RealClock
 
-__all__ = ["Cell", "Lease", "paced_cells"]
+__all__ = ["CellBackend", "Lease", "paced_cells"]
 
 logger = logging.getLogger(__name__)
 
@@ -107,12 +107,12 @@ class Lease:
     def __post_init__(self) -> None:
         self._is_own = self.gym_token is None
 
-    def __call__(self, count: int) -> list[Cell]:
+    def __call__(self, count: int) -> list[CellBackend]:
         """Make backends for a number of cells."""
         self._count = count
         if count > 1 and self.gym_time is None:
             self.gym_time = _DEFAULT_GYM_TIME
-        return [Cell(self, _like(self.client)) for _ in range(count)]
+        return [CellBackend(self, _like(self.client)) for _ in range(count)]
 
     def open(self) -> None:
         """Make the lease if one is needed and there is none."""
@@ -135,7 +135,7 @@ class Lease:
         return token, is_leased
 
 
-class Cell:
+class CellBackend:
     """A cell as a backend: it reads position and velocity at the tick, then sets the torque.
 
     See ``Backend``.

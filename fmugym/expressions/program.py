@@ -25,10 +25,10 @@ __all__ = [
     "Program",
     "UncompilableError",
     "engine",
-    "evaluate",
     "is_function",
     "letter_of",
     "operation_of",
+    "run_program",
 ]
 
 _OF_EACH_TYPE: Final = (
@@ -195,7 +195,7 @@ class Program:
         return form, tuple(map(find, self.rows))
 
 
-def evaluate(
+def run_program(
     program: Program,
     find: Callable[[Row], npt.NDArray[Any]],
     actions: tuple[npt.NDArray[Any], npt.NDArray[Any]],

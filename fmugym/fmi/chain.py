@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.systems.slots import Layout, Route
+from fmugym.systems.slots import Route, SystemLayout
 from fmugym.systems.system_description import PartVariable
 
 __all__ = ["chained_jacobian"]
@@ -20,7 +20,7 @@ Differentiate = Callable[[int, tuple[Variable, ...], tuple[Variable, ...]], _Flo
 
 
 def chained_jacobian(
-    layout: Layout, differentiate: Differentiate, count: int, unknowns: Ends, knowns: Ends
+    layout: SystemLayout, differentiate: Differentiate, count: int, unknowns: Ends, knowns: Ends
 ) -> _FloatArray:
     """Differentiate variables of a system by others, as if values were exchanged at all times.
 
@@ -52,7 +52,11 @@ class _Chain:
     """The derivatives of some variables by connections and by knowns."""
 
     def __init__(
-        self, layout: Layout, differentiate: Differentiate, count: int, routes: Sequence[Route]
+        self,
+        layout: SystemLayout,
+        differentiate: Differentiate,
+        count: int,
+        routes: Sequence[Route],
     ) -> None:
         self._layout, self._differentiate = layout, differentiate
         self._count, self._routes = count, routes
@@ -80,17 +84,17 @@ def _within(ends: Iterable[PartVariable], part: int) -> list[PartVariable]:
     return [end for end in ends if end.part == part]
 
 
-def _source(layout: Layout, route: Route) -> PartVariable:
+def _source(layout: SystemLayout, route: Route) -> PartVariable:
     part = layout.parts[route.source_part]
     return PartVariable(route.source_part, part.outputs[route.source - part.first_output])
 
 
-def _target(layout: Layout, route: Route) -> PartVariable:
+def _target(layout: SystemLayout, route: Route) -> PartVariable:
     part = layout.parts[route.target_part]
     variable = part.inputs[route.target - part.first_input]
     return PartVariable(route.target_part, variable, route.gain)
 
 
-def _is_continuous(layout: Layout, route: Route) -> bool:
+def _is_continuous(layout: SystemLayout, route: Route) -> bool:
     ends = _source(layout, route).variable, _target(layout, route).variable
     return all(one.kind == "real" and one.variability == "continuous" for one in ends)

@@ -29,8 +29,8 @@ from fmugym.distributions import DrawnColumn
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
-from fmugym.identification.problem import Limits, Problem
-from fmugym.identification.simulator import Experiment
+from fmugym.identification.problem import ParameterLimits, Problem
+from fmugym.identification.simulator import FitSettings
 from fmugym.identification.statistics import Correlation
 from fmugym.identification.trajectory import Trajectory, named_as_own
 from fmugym.pool.base import FloatArray
@@ -73,7 +73,7 @@ class FitResult:
     comparison: Comparison
     converged: bool
     message: str
-    experiment: Experiment
+    experiment: FitSettings
     """The settings, which predictions need."""
 
     @property
@@ -203,7 +203,7 @@ class FitResult:
 
     def _for_prediction(
         self, trajectories: Sequence[Trajectory]
-    ) -> tuple[Experiment, list[Trajectory]]:
+    ) -> tuple[FitSettings, list[Trajectory]]:
         """Fix the fitted values, and add fitted constants to the logged inputs."""
         fmu = self.experiment.fmu
         trajectories = named_as_own(trajectories, _own_name_in(fmu))
@@ -215,7 +215,7 @@ class FitResult:
 
 def fit_parameters(
     fmu: FMU | StandsForFMU | str | os.PathLike[str],
-    parameters: Mapping[str, Limits],
+    parameters: Mapping[str, ParameterLimits],
     trajectories: Sequence[Trajectory],
     *,
     initial_states: Mapping[str, str | float] | None = None,
@@ -266,7 +266,7 @@ def fit_parameters(
         raise ConfigError("there is no parameter to fit")
     opened = FMU.of(fmu)
     own_name = _own_name_in(opened)
-    experiment = Experiment(
+    experiment = FitSettings(
         opened,
         by_own_names("initial_states", _mapping("initial_states", initial_states), own_name),
         by_own_names("fixed", _mapping("fixed", fixed), own_name),
@@ -289,8 +289,8 @@ def _own_name_in(fmu: FMU) -> Callable[[str], str]:
 
 
 def fit_of(
-    experiment: Experiment,
-    parameters: Mapping[str, Limits],
+    experiment: FitSettings,
+    parameters: Mapping[str, ParameterLimits],
     trajectories: Sequence[Trajectory],
     candidates: int,
 ) -> FitResult:

@@ -19,7 +19,7 @@ from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
-from fmugym.identification.simulator import Experiment, Simulator
+from fmugym.identification.simulator import FitSettings, Simulator
 from fmugym.identification.statistics import (
     ROUNDING,
     Correlation,
@@ -31,9 +31,9 @@ from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.starting import start_variable
 
-__all__ = ["Limits", "Problem", "start_between"]
+__all__ = ["ParameterLimits", "Problem", "start_between"]
 
-Limits = float | tuple[float, float] | tuple[float, float, float]
+ParameterLimits = float | tuple[float, float] | tuple[float, float, float]
 
 DIFFERENCE = 1e-6
 """Step of the finite differences, as a fraction of a value's typical size."""
@@ -110,8 +110,8 @@ class Problem:
 
     def __init__(
         self,
-        experiment: Experiment,
-        parameters: Mapping[str, Limits],
+        experiment: FitSettings,
+        parameters: Mapping[str, ParameterLimits],
         trajectories: Sequence[Trajectory],
     ) -> None:
         outputs, _ = common_names(trajectories)
@@ -132,7 +132,9 @@ class Problem:
         count = 1 + len(self._rows)
         self._simulator = Simulator(experiment, self.trajectories, variables, count)
 
-    def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
+    def _set_limits(
+        self, variables: Sequence[Variable], parameters: Mapping[str, ParameterLimits]
+    ) -> None:
         count = len(parameters)
         limits = [_limits(v, parameters[v.name]) for v in variables[:count]]
         self.bounds = {name: one[1:] for name, one in zip(parameters, limits, strict=True)}
@@ -382,7 +384,7 @@ def _levenberg_marquardt(
     return states, blocks
 
 
-def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
+def _limits(variable: Variable, limits: ParameterLimits) -> tuple[float, float, float]:
     """Return start value, lower and upper bound of a parameter."""
     entries = limits if isinstance(limits, tuple | list | np.ndarray) else (limits,)
     numbers = tuple(float_or_nan(entry) for entry in entries)
@@ -399,7 +401,7 @@ def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
     return numbers[0], numbers[1], numbers[2]
 
 
-def _settable(experiment: Experiment, name: str) -> Variable:
+def _settable(experiment: FitSettings, name: str) -> Variable:
     variable = start_variable(experiment.fmu.description, name, 0.0)
     if variable.kind != "real":
         raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
@@ -413,7 +415,7 @@ def start_between(value: float, low: float, high: float) -> float:
     return value if low <= value <= high else (low + high) / 2
 
 
-def _counted(trajectory: Trajectory, experiment: Experiment) -> MaskArray:
+def _counted(trajectory: Trajectory, experiment: FitSettings) -> MaskArray:
     """Which samples of a trajectory count: those after the wash-in."""
     since, wash_in = trajectory.time - trajectory.time[0], experiment.wash_in
     begin = -1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0)

@@ -33,8 +33,8 @@ class Residual(ResidualPolicy):
         scale: The part of the range.
         model: The model; None for one that is trained now.
         normalization: Its ``VecNormalize``, or None.
-        task: The names of what it observes and the action space in words, see ``ResidualAgent``; it is
-            for this task only. None for any.
+        task: The names of what it observes and the action space in words, see ``ResidualAgent``;
+            it is for this task only. None for any.
     """
 
     baseline: Controller

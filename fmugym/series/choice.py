@@ -18,12 +18,12 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.task.quantity import Quantities, Quantity
 from fmugym.task.roles import require_numeric
 
-__all__ = ["Choice", "Episodes", "choose", "matches", "quantities_of"]
+__all__ = ["RecordedEnvs", "RecordedQuantities", "choose", "matches", "quantities_of"]
 
 _VARYING: Final = ("continuous", "discrete")
 
 
-class Episodes(Protocol):
+class RecordedEnvs(Protocol):
     """N environments to read.
 
     Attributes:
@@ -44,7 +44,7 @@ class Episodes(Protocol):
         """Reads variables of the FMUs."""
 
 
-class Choice(NamedTuple):
+class RecordedQuantities(NamedTuple):
     """The values that a recorder writes down.
 
     Attributes:
@@ -61,7 +61,7 @@ class Choice(NamedTuple):
     variables: tuple[Variable, ...]
     observed: tuple[int, ...]
 
-    def present(self, episodes: Episodes, indices: Any) -> FloatArray:
+    def present(self, episodes: RecordedEnvs, indices: Any) -> FloatArray:
         """What M environments have at this moment, all but the observations.
 
         Args:
@@ -100,7 +100,7 @@ def matches(pattern: str, name: str) -> bool:
     return re.fullmatch(expression, name, re.DOTALL) is not None
 
 
-def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
+def choose(env: FMUEnv, patterns: Iterable[str] | None) -> RecordedQuantities:
     """Find the values that globs name.
 
     Args:
@@ -126,7 +126,7 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
     places = tuple(i for i, one in enumerate(quantities) if one.name in wanted)
     variables = tuple(others[name] for name in others if name in wanted)
     observed = tuple(index for name, index in seen.items() if name in wanted)
-    return Choice(
+    return RecordedQuantities(
         (
             *(quantities[place] for place in places),
             *map(_of_variable, variables),

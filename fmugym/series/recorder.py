@@ -16,9 +16,9 @@ from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
-from fmugym.series.choice import Episodes, choose
-from fmugym.series.rows import Infos, Outcome, Rows, batched
-from fmugym.series.store import Memory, Store, open_store
+from fmugym.series.choice import RecordedEnvs, choose
+from fmugym.series.rows import Infos, RecordedStep, RowMaker, batched_info
+from fmugym.series.store import MemoryStore, RowStore, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
 
@@ -35,7 +35,7 @@ class _Recorder:
 
     def __init__(
         self,
-        episodes: Episodes,
+        episodes: RecordedEnvs,
         variables: str | Iterable[str] | None,
         environments: Iterable[int] | None,
         every: float | None,
@@ -49,8 +49,8 @@ class _Recorder:
         self._every = _steps_of(every, episodes.prototype.inside.spec.time_step)
         self._path = None if path is None else check_path("the path of a recording", path)
         self._most_rows = check_count("most_rows", most_rows)
-        self._memory: Memory | None = None
-        self._stores: list[Store] = []
+        self._memory: MemoryStore | None = None
+        self._stores: list[RowStore] = []
         self.has_begun = False
 
     def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> None:
@@ -63,16 +63,16 @@ class _Recorder:
         if self.has_begun:
             return
         self.has_begun = True
-        self._rows = Rows(self.episodes, self._choice, self._indices, self._every, infos)
+        self._rows = RowMaker(self.episodes, self._choice, self._indices, self._every, infos)
         if steps is not None:
             self._rows.go_on(steps)
         if self._path is not None:
             self._stores.append(open_store(self._path, self._rows.none.columns))
             weakref.finalize(self, self._stores[0].close)
-        self._memory = Memory(self._rows.none, self._most_rows)
+        self._memory = MemoryStore(self._rows.none, self._most_rows)
         self._stores.append(self._memory)
 
-    def add(self, outcome: Outcome, idle: MaskArray, steps: Any) -> None:
+    def add(self, outcome: RecordedStep, idle: MaskArray, steps: Any) -> None:
         """Write down a step, before which episodes had so many steps, shape (N,)."""
         self._open(outcome.infos, steps)
         self._add(self._rows.add(outcome, idle))
@@ -121,7 +121,7 @@ def _steps_of(every: float | None, time_step: float) -> int:
 
 
 class _One:
-    """A single environment, as ``Episodes``."""
+    """A single environment, as ``RecordedEnvs``."""
 
     is_vector = False
 
@@ -188,7 +188,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and write its first row; see ``FMUEnv.reset``."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._recorder.begin(np.array([True]), Infos(batched(info), 1), _batch(observation))
+        self._recorder.begin(np.array([True]), Infos(batched_info(info), 1), _batch(observation))
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -196,8 +196,8 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(action)
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
-        infos, seen = Infos(batched(info), 1), _batch(observation)
-        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen)
+        infos, seen = Infos(batched_info(info), 1), _batch(observation)
+        outcome = RecordedStep(np.array([float(reward)]), *flags, infos, seen)
         self._recorder.add(outcome, no, self._recorder.episodes.prototype.step_count - 1)
         return observation, reward, terminated, truncated, info
 
@@ -216,7 +216,7 @@ def _batch(observation: Any) -> Any:
 
 
 class _Many:
-    """The environments of a vector environment, as ``Episodes``."""
+    """The environments of a vector environment, as ``RecordedEnvs``."""
 
     is_vector = True
 
@@ -325,7 +325,7 @@ class RecordVectorSeries(VectorWrapper):
         observations, rewards, terminated, truncated, infos = result
         self._envs.actions = np.array(actions)
         begun, ended, told = self._ended, terminated | truncated, Infos(infos, self.num_envs)
-        outcome = Outcome(rewards, terminated, truncated, told, observations)
+        outcome = RecordedStep(rewards, terminated, truncated, told, observations)
         if same_step := self._mode is AutoresetMode.SAME_STEP and ended.any():
             outcome = outcome._replace(**self._last(infos, observations, ended))
         self._recorder.add(outcome, begun, self._steps)
@@ -335,7 +335,7 @@ class RecordVectorSeries(VectorWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _last(self, infos: Any, observations: Any, ended: MaskArray) -> dict[str, Any]:
-        """With what episodes have ended, as an ``Outcome`` has it, in the mode SAME_STEP."""
+        """With what episodes have ended, as an ``RecordedStep`` has it, in the mode SAME_STEP."""
         seen = observations
         if isinstance(observations, np.ndarray):
             seen = observations.copy()

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.series.choice import Choice, Episodes
+from fmugym.series.choice import RecordedEnvs, RecordedQuantities
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 from fmugym.task.starting import start_time_of
 
-__all__ = ["Infos", "Outcome", "Rows", "batched"]
+__all__ = ["Infos", "RecordedStep", "RowMaker", "batched_info"]
 
 _GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
 _TOLD: Final = {"kpis": "kpi", "proposed": "proposal", "predicted": "prediction"}
@@ -56,9 +56,11 @@ class Infos(NamedTuple):
         return now | _each(self.last, name)
 
 
-def batched(info: Mapping[str, Any]) -> dict[str, Any]:
+def batched_info(info: Mapping[str, Any]) -> dict[str, Any]:
     """The info of a single environment, as a vector environment of one gives it."""
-    values = {n: batched(one) if isinstance(one, Mapping) else [one] for n, one in info.items()}
+    values = {
+        n: batched_info(one) if isinstance(one, Mapping) else [one] for n, one in info.items()
+    }
     return values | {f"_{name}": [True] for name in info}
 
 
@@ -84,15 +86,16 @@ def _one(values: Any, index: int) -> Any:
     return values[index]
 
 
-class Outcome(NamedTuple):
+class RecordedStep(NamedTuple):
     """What a step of N environments has given.
 
     Attributes:
         rewards, terminated, truncated: Shape (N,).
         infos: The infos of the steps, those of steps that ended an episode included.
         observations: Likewise.
-        last: What environments had whose FMU is in the next episode already (``infos.ended``), a
-            row for each that is written down, as ``Choice.present`` gives it; None without such.
+        last: The last rows of environments whose FMU is in the next episode already
+            (``infos.ended``), one for each that is written down, as ``RecordedQuantities.present``
+            gives it; None without such.
     """
 
     rewards: FloatArray
@@ -103,7 +106,7 @@ class Outcome(NamedTuple):
     last: FloatArray | None = None
 
 
-class Rows:
+class RowMaker:
     """Makes rows of what environments do.
 
     Args:
@@ -120,8 +123,8 @@ class Rows:
 
     def __init__(
         self,
-        episodes: Episodes,
-        choice: Choice,
+        episodes: RecordedEnvs,
+        choice: RecordedQuantities,
         indices: npt.NDArray[np.intp],
         every: int,
         infos: Infos,
@@ -167,7 +170,7 @@ class Rows:
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations, infos), (no, no), infos)
 
-    def add(self, outcome: Outcome, idle: MaskArray) -> TimeSeries:
+    def add(self, outcome: RecordedStep, idle: MaskArray) -> TimeSeries:
         """Make the rows of a step.
 
         Args:

@@ -10,7 +10,7 @@ import numpy as np
 from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course
 from fmugym.surrogate.surrogate import Surrogate
-from fmugym.surrogate.terms import rows_of, simulated
+from fmugym.surrogate.terms import regressors_of, simulated
 
 if TYPE_CHECKING:
     from fmugym.figures import Figure
@@ -50,7 +50,7 @@ def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
     """
     terms, bounds = surrogate.terms, (surrogate.low, surrogate.high)
     longest = max(courses, key=lambda one: one.steps)
-    rows = rows_of(terms.form, longest)[:, None]
+    rows = regressors_of(terms.form, longest)[:, None]
     after = [*simulated(terms, [surrogate.weights.T], bounds, rows)]
     outputs = np.concatenate([longest.outputs[:1], np.array(after)[:, :, 0]])
     horizon = max(1, longest.steps // _PART)
@@ -63,7 +63,7 @@ def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
 def _squares(surrogate: Surrogate, course: Course, horizon: int) -> FloatArray:
     """The squared errors of predictions from each step on, shape (horizon, n, k)."""
     begins = range(course.steps - horizon + 1)
-    rows = rows_of(surrogate.terms.form, course)
+    rows = regressors_of(surrogate.terms.form, course)
     windows = np.stack([rows[:, one : one + horizon] for one in begins], axis=1)
     true = np.stack([course.outputs[one + 1 :][:horizon] for one in begins], axis=1)
     bounds = surrogate.low, surrogate.high

@@ -13,7 +13,7 @@ from fmugym.expressions.value import Value, where
 from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course
 
-__all__ = ["Form", "Terms", "rows_in", "rows_of", "simulated"]
+__all__ = ["SurrogateForm", "Terms", "regressors_of", "rows_in", "simulated"]
 
 _BEYOND: Final = 0.2
 """Numbers are clipped to their range in the courses, which is so much wider on both sides."""
@@ -25,7 +25,7 @@ Number = Callable[[float], Any]
 
 
 @dataclass(frozen=True)
-class Form:
+class SurrogateForm:
     """What the change of an output depends on.
 
     Attributes:
@@ -55,12 +55,12 @@ class Form:
         words += [f"{len(self.limited)} limited"] * bool(self.limited)
         return ", ".join(words)
 
-    def with_threshold(self, place: int, value: float) -> Form:
+    def with_threshold(self, place: int, value: float) -> SurrogateForm:
         """The form with another threshold of an input."""
         return replace(self, thresholds=(*self.thresholds, (place, value)))
 
 
-def rows_of(form: Form, course: Course) -> FloatArray:
+def regressors_of(form: SurrogateForm, course: Course) -> FloatArray:
     """What the steps of a course depend on, shape (d, T).
 
     These are the outputs, their changes in earlier steps, the inputs, their changes, and the
@@ -93,7 +93,7 @@ class Terms:
         pairs: The factors of each product, shape (2, q).
     """
 
-    form: Form
+    form: SurrogateForm
     widths: tuple[int, int]
     mean: FloatArray
     deviation: FloatArray
@@ -103,8 +103,8 @@ class Terms:
     pairs: Any = field(init=False)
 
     @classmethod
-    def of(cls, form: Form, rows: FloatArray, widths: tuple[int, int]) -> Terms:
-        """The terms, scaled by rows as ``rows_of`` gives them."""
+    def of(cls, form: SurrogateForm, rows: FloatArray, widths: tuple[int, int]) -> Terms:
+        """The terms, scaled by rows as ``regressors_of`` gives them."""
         low, high = rows.min(axis=1), rows.max(axis=1)
         beyond = _BEYOND * (high - low)
         deviation = rows.std(axis=1)
@@ -214,8 +214,8 @@ def simulated(
         terms: What a step depends on.
         weights: Sets of weights, each of shape (f, k).
         bounds: Between what outputs stay, each of shape (k,).
-        rows: As of ``rows_of``, of n simulations, shape (d, n, steps): the first ones tell where
-            they begin, and all tell the inputs.
+        rows: As of ``regressors_of``, of n simulations, shape (d, n, steps): the first ones tell
+            where they begin, and all tell the inputs.
 
     Yields:
         The outputs after each step, shape (k, sets * n).

@@ -161,10 +161,10 @@ class OpenComponent:
         nothing: dict[str, frozenset[str]] = dict.fromkeys(told.in_step, frozenset())
         return Feedthrough(nothing, nothing, known=True)
 
-    def planned(self) -> system_plan.Component:
+    def planned(self) -> system_plan.ComponentPlan:
         """The component as the master executes it."""
         limits, preload = self.fmu.limits, self.fmu.preload
-        return system_plan.Component(
+        return system_plan.ComponentPlan(
             self.name,
             self.fmu.path,
             self.fmu.interface,

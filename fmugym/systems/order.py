@@ -14,13 +14,13 @@ from typing import TypeVar
 from fmugym.archive.structure import Feedthrough
 from fmugym.systems.system_plan import Evaluation, Group, Link, Loop
 
-__all__ = ["Order", "order_of", "strong_components"]
+__all__ = ["SystemOrder", "order_of", "strong_components"]
 
 Node = TypeVar("Node", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Order:
+class SystemOrder:
     """The order of a system.
 
     Attributes:
@@ -47,7 +47,7 @@ def order_of(
     loop: Loop,
     unable: Container[str] = (),
     unable_at_start: Container[str] = (),
-) -> Order:
+) -> SystemOrder:
     """Order the components and links of a system.
 
     A component steps after those whose new values act on its outputs at once. Where nothing asks
@@ -72,7 +72,7 @@ def order_of(
     at_start = _chains(links, {name: one.at_start for name, one in told.items()})
     evaluable, unsolved_at_start = _cut(at_start, links, unable_at_start)
     evaluations = tuple(_evaluations(evaluable, loop))
-    return Order(groups, evaluations, loops, late, unsolved, unsolved_at_start)
+    return SystemOrder(groups, evaluations, loops, late, unsolved, unsolved_at_start)
 
 
 def _cut(

@@ -14,9 +14,9 @@ from typing import TypeAlias
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.systems.system_description import PartVariable, SystemDescription
-from fmugym.systems.system_plan import Component, Evaluation, Group
+from fmugym.systems.system_plan import ComponentPlan, Evaluation, Group
 
-__all__ = ["Layout", "PartLayout", "Route", "array_key"]
+__all__ = ["PartLayout", "Route", "SystemLayout", "array_key"]
 
 
 @dataclass
@@ -31,7 +31,7 @@ class PartLayout:
         first_input, first_output: The numbers of its first slots.
     """
 
-    component: Component
+    component: ComponentPlan
     description: ModelDescription
     inputs: list[Variable] = field(default_factory=list)
     outputs: list[Variable] = field(default_factory=list)
@@ -81,7 +81,7 @@ class Route:
     link: int
 
 
-class Layout:
+class SystemLayout:
     """The slots and routes of a system.
 
     Args:

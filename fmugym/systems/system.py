@@ -83,9 +83,9 @@ class FMUSystem(WiredSystem):
             FMULoadError: If the archive or an FMU cannot be read, or it has something that changes
                 results and is not supported, such as signal dictionaries.
         """
-        from fmugym.systems.ssp.archives import arguments_of  # optional: only archives need it
+        from fmugym.systems.ssp.archives import system_arguments  # optional: only archives need it
 
-        arguments = arguments_of(path, limits)
+        arguments = system_arguments(path, limits)
         if master is not None:
             arguments["master"] = master
         try:

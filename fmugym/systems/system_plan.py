@@ -28,7 +28,7 @@ from fmugym.archive.safe_zip import ArchiveLimits
 
 __all__ = [
     "MASTERS",
-    "Component",
+    "ComponentPlan",
     "Connector",
     "End",
     "Evaluation",
@@ -43,7 +43,7 @@ MASTERS: Final = ("gauss_seidel", "jacobi")
 
 
 @dataclass(frozen=True)
-class Component:
+class ComponentPlan:
     """One FMU of a system.
 
     Attributes:
@@ -186,7 +186,7 @@ class SystemPlan:
     """
 
     name: str
-    components: tuple[Component, ...]
+    components: tuple[ComponentPlan, ...]
     links: tuple[Link, ...] = ()
     groups: tuple[Group, ...] = ()
     initialization: tuple[Evaluation, ...] = ()

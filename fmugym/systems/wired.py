@@ -26,7 +26,7 @@ from fmugym.keys import (
 )
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
-from fmugym.systems.order import Order, order_of
+from fmugym.systems.order import SystemOrder, order_of
 from fmugym.systems.system_plan import MASTERS, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
@@ -162,7 +162,7 @@ class WiredSystem:
         return f"{type(self).__name__}({self.name!r}: {', '.join(self.components)})"
 
     @cached_property
-    def order(self) -> Order:
+    def order(self) -> SystemOrder:
         """The order of steps and of the initialization, and the algebraic loops."""
         told = {name: one.feedthrough for name, one in self.components.items()}
         parts = {name: one.fmu.description for name, one in self.components.items()}
@@ -239,7 +239,7 @@ _ARGUMENTS: Final = tuple(
 )
 
 
-def _findings_of(order: Order) -> Iterator[str]:
+def _findings_of(order: SystemOrder) -> Iterator[str]:
     for loop in order.loops:
         yield f"algebraic loop: {_told_loop(loop)}"
     for name in order.unsolved:
