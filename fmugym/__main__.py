@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from fmugym.tools.ending import end_as_after_ctrl_c, exit_code
+from fmugym.tools.signal_handling import end_as_after_ctrl_c, exit_code
 
 __all__ = ["main"]
 

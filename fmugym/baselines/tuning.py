@@ -9,16 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.candidate_evaluation import MOST_STEPS, CandidateEvaluator
+from fmugym.baselines.candidate_search import CandidateSearch
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.controller import Controller
-from fmugym.baselines.entrants import Entrant
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray
 
-__all__ = ["Tuning", "entrant_of", "numbers_at", "tune"]
+__all__ = ["Tuning", "candidate_search_of", "numbers_at", "tune"]
 
 _LEAST_CANDIDATES: Final = 8
 _SIGMA: Final = 0.2
@@ -42,17 +42,17 @@ class Tuning:
     returns: tuple[float, ...]
 
 
-def entrant_of(
+def candidate_search_of(
     make: Any,
     ranges: Mapping[str, Uniform | LogUniform],
     sizes: tuple[int, int],
     episodes: int,
     rng: np.random.Generator,
-) -> Entrant:
+) -> CandidateSearch:
     """A search for numbers, which begins everywhere and goes on from the best candidate.
 
     Args:
-        make: As for an ``Entrant``.
+        make: As for a ``CandidateSearch``.
         ranges: What ``numbers_at`` takes.
         sizes: The candidates of the first round, and of the others.
         episodes: How many each candidate plays.
@@ -61,7 +61,7 @@ def entrant_of(
     first, others = sizes
     places = rng.uniform(size=(first, len(ranges)))
     cma = CMA(places[0], _SIGMA, others, rng, growth=1.0)
-    return Entrant(cma, make, episodes, first=places)
+    return CandidateSearch(cma, make, episodes, first=places)
 
 
 def numbers_at(
@@ -134,7 +134,7 @@ def tune(
     if not ranges:
         raise ConfigError("search needs the name of at least one number")
     seed = check_seed(seed) or 0
-    entrant = entrant_of(
+    candidate_search = candidate_search_of(
         lambda rows: make_controller(**numbers_at(ranges, rows)),
         ranges,
         (candidates, candidates),
@@ -142,11 +142,14 @@ def tune(
         np.random.default_rng(seed),
     )
     returns: list[float] = []
-    with closing(Arena(make_env, most_steps=most_steps, advance=advance)) as arena:
+    with closing(CandidateEvaluator(make_env, most_steps=most_steps, advance=advance)) as evaluator:
         for _ in range(rounds):
-            _, reached = entrant.play(arena, range(seed, seed + episodes))
+            _, reached = candidate_search.play(evaluator, range(seed, seed + episodes))
             returns.append(reached)
-            best = {name: float(one) for name, one in numbers_at(ranges, entrant.leader).items()}
+            best = {
+                name: float(one)
+                for name, one in numbers_at(ranges, candidate_search.leader).items()
+            }
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
             if watch is not None:
                 watch(found)

@@ -21,7 +21,7 @@ from fmugym.declared.file_lists import chosen_files, file_lists
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
 from fmugym.declared.kpis import read_kpi
-from fmugym.declared.parts import (
+from fmugym.declared.section_entries import (
     Limits,
     Term,
     read_derived,
@@ -33,7 +33,7 @@ from fmugym.declared.setpoints import SetPoints
 from fmugym.declared.spelling import as_declared
 from fmugym.declared.standard_time import standard_time
 from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, declared_start
-from fmugym.declared.warming import read_warm_up
+from fmugym.declared.warm_up_table import read_warm_up
 from fmugym.errors import ConfigError
 from fmugym.expressions.language import CONSTANTS, Expression
 from fmugym.expressions.mathematics import FUNCTIONS

@@ -12,7 +12,7 @@ from fmugym.distributions import Choice
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
     from fmugym.declared.entries import Entry
-    from fmugym.declared.parts import MemoryVariable
+    from fmugym.declared.section_entries import MemoryVariable
     from fmugym.declared.variables import TaskVariable
     from fmugym.expressions.value import Value
 

@@ -15,7 +15,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
 from fmugym.declared.numbers import nearest_steps, steps_in
-from fmugym.declared.parts import Limits
+from fmugym.declared.section_entries import Limits
 from fmugym.declared.variables import TaskVariable
 from fmugym.expressions.value import Value, where
 

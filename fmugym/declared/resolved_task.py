@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
-from fmugym.declared.blaming import explanation
 from fmugym.declared.configuring import (
     beginning_of,
     bounds_of,
@@ -21,11 +20,11 @@ from fmugym.declared.configuring import (
     times_of,
 )
 from fmugym.declared.declarations import Declarations
+from fmugym.declared.declared_quantities import named_values
 from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_written
 from fmugym.declared.kpis import Kpi, kpi_name
-from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
 from fmugym.declared.numbers import steps_in
 from fmugym.declared.observing import (
@@ -38,11 +37,12 @@ from fmugym.declared.observing import (
     remembered,
     scaled,
 )
-from fmugym.declared.parts import Term
-from fmugym.declared.piloting import DeclaredWarmUp
+from fmugym.declared.reward_explanation import explanation
 from fmugym.declared.seasons import held_out_times
+from fmugym.declared.section_entries import Term
 from fmugym.declared.task import Task
 from fmugym.declared.variables import TaskVariable, has_fmu_values
+from fmugym.declared.warm_up_controllers import DeclaredWarmUp
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of, update_by

@@ -13,7 +13,7 @@ from fmugym.declared.data_rows import read_rows
 from fmugym.declared.dates import DAY, YEAR
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import files_of, variable_of
-from fmugym.declared.parts import Limits, read_limits
+from fmugym.declared.section_entries import Limits, read_limits
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.future import Span, distance_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import RAMP, SETPOINT, SINE, STEPS
-from fmugym.declared.parts import Derived, Limits, MemoryVariable, read_limits
+from fmugym.declared.section_entries import Derived, Limits, MemoryVariable, read_limits
 from fmugym.declared.series import Series, read_schedule
 from fmugym.expressions.language import Expression
 

@@ -16,7 +16,7 @@ from fmugym.checks import Spellings, normal_form
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
 from fmugym.declared.numbers import number_or_distribution
-from fmugym.declared.parts import Limits, read_limits
+from fmugym.declared.section_entries import Limits, read_limits
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
 from fmugym.task.ranges import within

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import most_steps_of
+from fmugym.baselines.candidate_evaluation import most_steps_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.episodes.simulation import Player, Policy, Summary, simulate

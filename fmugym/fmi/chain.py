@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.systems.slots import Route, SystemLayout
 from fmugym.systems.system_description import PartVariable
+from fmugym.systems.system_layout import Route, SystemLayout
 
 __all__ = ["chained_jacobian"]
 

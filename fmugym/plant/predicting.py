@@ -12,7 +12,7 @@ import numpy as np
 from fmugym.baselines.observer import COPIES, Observer, parameters_of_copies
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.written import Written
+from fmugym.plant.plant_actions import PlantActions
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Error", "Predictions"]
@@ -56,7 +56,7 @@ class Predictions:
         self.envs = [make_env()] if steps else []
         self._spread = parameters_of_copies(self.envs[0], 0) if steps else {}
         self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
-        self._written = [Written(env, feed) for env in self.envs]
+        self._written = [PlantActions(env, feed) for env in self.envs]
         self._tags = feed.plant.of(self.envs[0].inside.spec.outputs) if steps else []
         self.names = [tag.name for tag in self._tags]
         # of the errors, by horizon and variable: how many, their sum, and that of their squares

@@ -17,11 +17,11 @@ from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
 from fmugym.plant.feed import Feed
 from fmugym.plant.live import Live
+from fmugym.plant.plant_actions import PlantActions
 from fmugym.plant.polling import Poller, protocol_of
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA_PREFIX, read_plant
-from fmugym.plant.written import Written
 from fmugym.pool.backend.clocks import Clock, RealClock
 
 __all__ = ["Shadow", "connect"]
@@ -60,7 +60,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(
-        self, env: TaskEnv, feed: Feed, written: Written, copies: Predictions, owned: ExitStack
+        self, env: TaskEnv, feed: Feed, written: PlantActions, copies: Predictions, owned: ExitStack
     ) -> None:
         super().__init__(env)
         self._feed, self._written, self._owned = feed, written, owned
@@ -136,7 +136,7 @@ def connect(
     with ExitStack() as stack:
         env = stack.enter_context(closing(environment(own, backend=feed)))
         feed.plant = plant = read_plant(env, address)
-        written = Written(env, feed)
+        written = PlantActions(env, feed)
         for output in env.inside.spec.outputs:
             plant.require(output)
         env.inside.held = feed.held

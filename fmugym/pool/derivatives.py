@@ -13,8 +13,8 @@ from fmugym.fmi.chain import chained_jacobian
 from fmugym.pool.base import FloatArray
 from fmugym.pool.form import table_of
 from fmugym.pool.spec import PoolSpec
-from fmugym.systems.slots import SystemLayout
 from fmugym.systems.system_description import SystemDescription
+from fmugym.systems.system_layout import SystemLayout
 
 __all__ = ["Variables", "differentiated"]
 

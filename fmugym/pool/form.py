@@ -31,8 +31,8 @@ from fmugym.pool.spec import (
     ResetMethod,
     is_start_time,
 )
-from fmugym.systems.slots import PartLayout, SystemLayout, array_key
 from fmugym.systems.system_description import PartVariable, SystemDescription
+from fmugym.systems.system_layout import PartLayout, SystemLayout, array_key
 from fmugym.systems.system_plan import Loop
 from fmugym.wine.installation import windows_path, windows_uri
 

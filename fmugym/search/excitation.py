@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.baselines.controller import Controller
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.pool.base import FloatArray
@@ -85,22 +85,26 @@ def fitted_surrogate(
         backend=courses,
     )
     length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
-    with closing(Arena(make_env, _GROUP, length, backend=courses)) as arena:
-        excite(arena, courses, probe, (steps - courses.steps) // length, rng)
+    with closing(CandidateEvaluator(make_env, _GROUP, length, backend=courses)) as evaluator:
+        excite(evaluator, courses, probe, (steps - courses.steps) // length, rng)
         found, known = fit(courses), len(courses.all())
         if unseen:
-            arena.most_steps = probe.most_steps
-            excite(arena, courses, probe, unseen, rng)
+            evaluator.most_steps = probe.most_steps
+            excite(evaluator, courses, probe, unseen, rng)
     return found, [one for one in courses.all()[known:] if one.steps]
 
 
 def excite(
-    arena: Arena, courses: Courses, probe: Probe, count: int, rng: np.random.Generator
+    evaluator: CandidateEvaluator,
+    courses: Courses,
+    probe: Probe,
+    count: int,
+    rng: np.random.Generator,
 ) -> None:
     """Play episodes with the untuned controllers of a task, whose actions are disturbed.
 
     Args:
-        arena: Its episodes are no longer than they shall be; its backend are the courses.
+        evaluator: Its episodes are no longer than they shall be; its backend are the courses.
         courses: Keep what the FMU does.
         probe: What is known of the task.
         count: How many episodes there are.
@@ -111,9 +115,9 @@ def excite(
         own = seeds[place :: len(probe.agents)]
         if own:
             seed = int(rng.integers(_SEEDS))
-            made = partial(_excitation, arena, agent, seed)
-            arena.play(made, np.zeros((1, 1)), own)
-    envs = arena.open(1)
+            made = partial(_excitation, evaluator, agent, seed)
+            evaluator.play(made, np.zeros((1, 1)), own)
+    envs = evaluator.open(1)
     starts = rng.integers(_SEEDS, size=_STARTS)
     for begin in range(0, _STARTS, envs.num_envs):
         before = courses.steps
@@ -122,9 +126,11 @@ def excite(
             return
 
 
-def _excitation(arena: Arena, agent: ResidualAgent, seed: int, rows: FloatArray) -> Any:
-    """The excitation of the episodes that an arena plays next."""
-    return Excitation(_untuned(agent), seed, arena.jobs)
+def _excitation(
+    evaluator: CandidateEvaluator, agent: ResidualAgent, seed: int, rows: FloatArray
+) -> Any:
+    """The excitation of the episodes that an evaluator plays next."""
+    return Excitation(_untuned(agent), seed, evaluator.jobs)
 
 
 def _untuned(agent: ResidualAgent) -> ResidualPolicy:

@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena, most_steps_of
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, most_steps_of
 from fmugym.baselines.table_texts import text_of
 from fmugym.errors import ConfigError
 from fmugym.search.pairing import MOST_PAIRED, best_pairing
@@ -146,11 +146,13 @@ def _steps_of_episode(loops: Loops, most: int) -> int:
     return min(most // episodes_of(len(loops.actions)), loops.most_steps)
 
 
-def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -> dict[str, str]:
-    """Test the plant of an arena by steps, and guess controllers; see ``guessed_controllers``.
+def suggested_controllers(
+    evaluator: CandidateEvaluator, loops: Loops, most: int = MOST_TESTED
+) -> dict[str, str]:
+    """Test the plant of an evaluator by steps, and guess controllers; see ``guessed_controllers``.
 
     Args:
-        arena: Of a task.
+        evaluator: Of a task.
         loops: What the task tells.
         most: The largest number of steps.
 
@@ -159,10 +161,10 @@ def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -
     """
     if len(loops.actions) > MOST_PAIRED:
         raise ConfigError(f"there are more than {MOST_PAIRED} actions")
-    arena.most_steps = _steps_of_episode(loops, most)
-    if arena.most_steps <= FEWEST:
+    evaluator.most_steps = _steps_of_episode(loops, most)
+    if evaluator.most_steps <= FEWEST:
         raise ConfigError(f"{most} steps are too few for a test of the actions")
-    return guessed_controllers(loops, step_test(arena, loops.limits))
+    return guessed_controllers(loops, step_test(evaluator, loops.limits))
 
 
 def controllers_for(make_env: Callable[[], Any], seconds: float) -> dict[str, str]:
@@ -176,10 +178,10 @@ def controllers_for(make_env: Callable[[], Any], seconds: float) -> dict[str, st
         loops = Loops.of(env.task.document, env)
     if loops is None:
         raise ConfigError("no expression of the task has the difference to a set point")
-    with closing(Arena(make_env, most_steps=_TRIED)) as arena:
-        step_test(arena, loops.limits)
-        most = seconds * arena.steps / max(arena.seconds, 1e-9)
-        return suggested_controllers(arena, loops, int(min(MOST_TESTED, most)))
+    with closing(CandidateEvaluator(make_env, most_steps=_TRIED)) as evaluator:
+        step_test(evaluator, loops.limits)
+        most = seconds * evaluator.steps / max(evaluator.seconds, 1e-9)
+        return suggested_controllers(evaluator, loops, int(min(MOST_TESTED, most)))
 
 
 def guessed_controllers(loops: Loops, responses: StepResponses) -> dict[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena, ArenaResult
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, CandidateScores
 from fmugym.baselines.controller import Controller, attribute_of, either, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.baselines.tuning import numbers_at
@@ -167,9 +167,9 @@ class ResidualAgent:
         """The controller, to be bound to an environment, as by a call."""
         return self(self.weights)
 
-    def play(self, arena: Arena, seeds: Sequence[int]) -> ArenaResult:
+    def play(self, evaluator: CandidateEvaluator, seeds: Sequence[int]) -> CandidateScores:
         """Let the agent play alone."""
-        return arena.play(self, np.atleast_2d(self.weights), seeds)
+        return evaluator.play(self, np.atleast_2d(self.weights), seeds)
 
     def save(self, folder: Path) -> None:
         """Write the agent to a folder; a file that is there is replaced."""

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena, most_steps_of
+from fmugym.baselines.candidate_evaluation import MOST_STEPS, CandidateEvaluator, most_steps_of
 from fmugym.baselines.parsing import plans_ahead, simple_controllers
 from fmugym.baselines.table_texts import acting_text, named_controllers, parts_of
 from fmugym.declared.likely_units import require_units
@@ -110,26 +110,35 @@ class Probe:
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
         steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
-        with closing(Arena(make_env, envs, _TRIED, backend=backend)) as arena:
+        with closing(CandidateEvaluator(make_env, envs, _TRIED, backend=backend)) as evaluator:
             seeds = range(_EPISODES)
             if seconds < np.inf:
-                arena.play(linear, rows[:_ACTIONS], seeds)
-                needed = most * arena.seconds / arena.steps
+                evaluator.play(linear, rows[:_ACTIONS], seeds)
+                needed = most * evaluator.seconds / evaluator.steps
                 steps = steps if needed <= seconds else max(_TRIED, int(steps * seconds / needed))
-            arena.most_steps, arena.seconds, arena.steps, arena.longest = steps, 0.0, 0, 0
-            outcome = arena.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
-            if arena.steps == outcome.costs[..., -1].sum():
+            evaluator.most_steps, evaluator.seconds, evaluator.steps, evaluator.longest = (
+                steps,
+                0.0,
+                0,
+                0,
+            )
+            outcome = evaluator.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
+            if evaluator.steps == outcome.costs[..., -1].sum():
                 raise ConfigError(
-                    f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
+                    f"the first step fails, whatever the action: {evaluator.infos['fault'][0]}; "
                     "'fmugym validate' tells more"
                 )
-            if most == MOST_PROBED and steps == _STEPS and arena.seconds < _QUICK * arena.steps:
-                arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
-                arena.play(linear, rows, seeds)
-            pace, longest = arena.seconds / arena.steps, arena.longest
+            if (
+                most == MOST_PROBED
+                and steps == _STEPS
+                and evaluator.seconds < _QUICK * evaluator.steps
+            ):
+                evaluator.most_steps, evaluator.seconds, evaluator.steps = _TIMED, 0.0, 0
+                evaluator.play(linear, rows, seeds)
+            pace, longest = evaluator.seconds / evaluator.steps, evaluator.longest
             if seconds < np.inf:
                 most_tested = int(min(most_tested, _TEST_BY_LOOK * seconds / max(pace, 1e-9)))
-            agents = agents or list(_guessed(arena, loops, tell, most_tested))
+            agents = agents or list(_guessed(evaluator, loops, tell, most_tested))
         seen = np.dstack([outcome.returns, outcome.moments])
         if np.ptp(outcome.returns) == 0:
             tell(
@@ -176,13 +185,16 @@ def _declared(
 
 
 def _guessed(
-    arena: Arena, loops: Loops | None, tell: Callable[[str], None], most_tested: int
+    evaluator: CandidateEvaluator,
+    loops: Loops | None,
+    tell: Callable[[str], None],
+    most_tested: int,
 ) -> Iterator[ResidualAgent]:
     """Controllers that a step test suggests for some loops."""
     if loops is None:
         return
     try:
-        guesses = suggested_controllers(arena, loops, most_tested)
+        guesses = suggested_controllers(evaluator, loops, most_tested)
     except ConfigError as error:
         tell(f"no controller is guessed: {error}")
     else:

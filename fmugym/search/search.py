@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.candidate_evaluation import MOST_STEPS, CandidateEvaluator
+from fmugym.baselines.candidate_search import NO_MERIT, CandidateSearch
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
-from fmugym.baselines.tuning import entrant_of
+from fmugym.baselines.tuning import candidate_search_of
 from fmugym.search.policy import ResidualAgent, scale_of
 from fmugym.search.probe import FEW, Probe
 
@@ -116,13 +116,13 @@ class Search:
         self.rounds, self.steps = 0, probe.steps
         self.rng = np.random.default_rng(seed)
         self.controllers = [
-            Entrant(None, one, self.episodes, rounds=_TUNING, best=one)
+            CandidateSearch(None, one, self.episodes, rounds=_TUNING, best=one)
             if one.is_found
-            else self._entrant(one)
+            else self._candidate_search(one)
             for one in probe.agents
         ]
         self.baseline: Any = None
-        self.policies: list[Entrant] = []
+        self.policies: list[CandidateSearch] = []
         self.scale = probe.linear.scale
         self.widths = [probe.linear.size, probe.linear.acting]
 
@@ -141,7 +141,7 @@ class Search:
         return not self.widths and not self._active
 
     @property
-    def tuning(self) -> Entrant | None:
+    def tuning(self) -> CandidateSearch | None:
         """The controller whose numbers are sought next, at last those of the best one alone."""
         new = min(self.controllers, key=attrgetter("rounds"))
         best = max(self.controllers, key=_MERIT)
@@ -149,46 +149,46 @@ class Search:
         return found if found.rounds < _most_rounds(found) else None
 
     @property
-    def _active(self) -> list[Entrant]:
+    def _active(self) -> list[CandidateSearch]:
         """The classes of policies that have not gone."""
         return [one for one in self.policies if one.starts < _STARTS]
 
     @property
-    def ahead(self) -> Entrant:
+    def ahead(self) -> CandidateSearch:
         """Who has the best agent in validation."""
         return max(self.controllers + self.policies, key=_MERIT)
 
     # Rounds.
 
-    def advance(self, arena: Arena) -> None:
+    def advance(self, evaluator: CandidateEvaluator) -> None:
         """Go on by one round, or by one that tells what observations are like."""
         if self.tuning:
-            self._play(self.tuning, arena)
+            self._play(self.tuning, evaluator)
         elif self.widths:
             if self.baseline is None:
                 for one in self.controllers:
                     if one.cma is None:
-                        one.merit = one.best.play(arena, self._seeds(VALIDATION)).merits[0]
+                        one.merit = one.best.play(evaluator, self._seeds(VALIDATION)).merits[0]
                 self.baseline = max(self.controllers, key=_MERIT)
-            self._look(arena, self.baseline.best)
+            self._look(evaluator, self.baseline.best)
         else:
             leaders = self._leaders()
-            self._play(self._next(leaders), arena)
+            self._play(self._next(leaders), evaluator)
             for one in leaders:
                 if one.rounds - one.gained >= _ROUNDS_WITHOUT_GAIN:
                     self._change(one)
 
-    def _leaders(self) -> list[Entrant]:
+    def _leaders(self) -> list[CandidateSearch]:
         """The best two; one that is not better than the baseline leads only if none is."""
         ranked = sorted(self._active, key=_MERIT, reverse=True)
         return ([one for one in ranked if one.merit > self.baseline.merit] or ranked)[:2]
 
-    def _next(self, leaders: Sequence[Entrant]) -> Entrant:
+    def _next(self, leaders: Sequence[CandidateSearch]) -> CandidateSearch:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
         behind = [one for one in self._active if one.rounds < self.rounds // _SHARE]
         return behind[0] if behind else min(leaders, key=attrgetter("last_round"))
 
-    def _change(self, leader: Entrant) -> None:
+    def _change(self, leader: CandidateSearch) -> None:
         """Give a leader that gains nothing a new start with more episodes; it may be its last."""
         leader.take_more_episodes()
         leader.starts += 1
@@ -196,34 +196,38 @@ class Search:
         leader.gained = leader.rounds
         if leader.then is not None:
             (start,) = leader.then.extended(leader.best.weights[None])
-            self.policies.append(self._entrant(leader.then.with_numbers(start)))
+            self.policies.append(self._candidate_search(leader.then.with_numbers(start)))
             leader.then = None
 
-    def _play(self, entrant: Entrant, arena: Arena) -> None:
-        entrant.play(arena, self.rng.integers(VALIDATION, size=entrant.episodes).tolist())
+    def _play(self, candidate_search: CandidateSearch, evaluator: CandidateEvaluator) -> None:
+        candidate_search.play(
+            evaluator, self.rng.integers(VALIDATION, size=candidate_search.episodes).tolist()
+        )
         self.rounds += 1
-        entrant.last_round = self.rounds
-        if entrant.rounds % _EVERY == 0:
-            entrant.validate(arena, self._seeds(VALIDATION))
+        candidate_search.last_round = self.rounds
+        if candidate_search.rounds % _EVERY == 0:
+            candidate_search.validate(evaluator, self._seeds(VALIDATION))
 
     def _seeds(self, first: int, count: int = _VALIDATED) -> range:
         """Seeds of a validation; one is enough if all episodes are the same."""
         return range(first, first + (1 if self.probe.is_same else count))
 
-    def revalidate(self, arena: Arena) -> None:
+    def revalidate(self, evaluator: CandidateEvaluator) -> None:
         """Go on in another environment: merits become those that the agents have there."""
         for one in (*self.controllers, *self.policies):
             one.lead, one.starts, one.gained = NO_MERIT, 0, one.rounds
             if one.best:
-                one.merit = one.best.play(arena, self._seeds(VALIDATION)).merits[0]
+                one.merit = one.best.play(evaluator, self._seeds(VALIDATION)).merits[0]
 
     # Who takes part.
 
-    def _entrant(self, agent: ResidualAgent, then: ResidualAgent | None = None) -> Entrant:
+    def _candidate_search(
+        self, agent: ResidualAgent, then: ResidualAgent | None = None
+    ) -> CandidateSearch:
         if has_range(agent.text):
             ranges = search_of(agent.text).ranges
-            return entrant_of(agent, ranges, (_MANY, FEW), self.episodes, self.rng)
-        return Entrant(self._cma(agent), agent, self.episodes, then)
+            return candidate_search_of(agent, ranges, (_MANY, FEW), self.episodes, self.rng)
+        return CandidateSearch(self._cma(agent), agent, self.episodes, then)
 
     def _cma(self, agent: ResidualAgent) -> CMA:
         """The search for the weights of an agent, which begins with its own ones, or 0."""
@@ -232,7 +236,7 @@ class Search:
         population = _MANY if agent.observed else FEW
         return CMA(mean, sigma, population, self.rng, largest=_LARGEST, growth=_GROWTH)
 
-    def _look(self, arena: Arena, baseline: ResidualAgent) -> None:
+    def _look(self, evaluator: CandidateEvaluator, baseline: ResidualAgent) -> None:
         """See what observations are like for the best of some candidates that correct the baseline.
 
         Policies that are worth something see the like, while others may drive the process far away.
@@ -246,7 +250,7 @@ class Search:
         drawn = self.rng.standard_normal((_RANDOM, self.widths.pop()))
         rows = agent.extended(sizes * drawn)
         seeds = self.rng.integers(VALIDATION, size=self.episodes).tolist()
-        outcome = arena.play(agent, rows, seeds, has_moments=True)
+        outcome = evaluator.play(agent, rows, seeds, has_moments=True)
         self.rounds += 1
         best = outcome.moments[outcome.order[: _RANDOM // _BEST_PART]]
         self.scale = scale_of(best.sum(axis=(0, 1)))
@@ -263,8 +267,8 @@ class Search:
         for text in dict.fromkeys((baseline.text, None)):
             prefix = f"{baseline.name} + " if text else ""
             pair = (replace(one, name=prefix + one.name, text=text) for one in linear_ones)
-            self.policies.append(self._entrant(*pair))
-        self.policies.append(self._entrant(network))
+            self.policies.append(self._candidate_search(*pair))
+        self.policies.append(self._candidate_search(network))
 
     # Who wins.
 
@@ -287,13 +291,13 @@ class Search:
         most = self.rounds * FEW * self.episodes // (_PART * (len(agents) or 1))
         return agents, self._seeds(_FINAL, min(_LAST, max(self.episodes, most)))
 
-    def winner(self, arena: Arena) -> ResidualAgent | None:
+    def winner(self, evaluator: CandidateEvaluator) -> ResidualAgent | None:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
-        return max(agents, key=lambda one: one.play(arena, seeds).merits[0], default=None)
+        return max(agents, key=lambda one: one.play(evaluator, seeds).merits[0], default=None)
 
 
-def _most_rounds(controller: Entrant) -> int:
+def _most_rounds(controller: CandidateSearch) -> int:
     """The rounds for the numbers of a controller, if it is the best one."""
     text = controller.make.text
     return max(_TUNING, _A_NUMBER * len(search_of(text).ranges) if has_range(text) else 0)

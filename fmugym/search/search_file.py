@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.baselines.candidate_search import CandidateSearch
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.errors import ConfigError
 from fmugym.search.policy import ResidualAgent
@@ -30,7 +30,7 @@ _TEXT: Final = "text"
 """The name of the array of bytes that is the text."""
 
 _COUNTS: Final = ("episodes", "rounds", "gained", "starts", "last_round")
-"""Those of an ``Entrant``."""
+"""Counts of a ``CandidateSearch``."""
 
 _MOST: Final = 1_000_000
 """No count of numbers is larger; a damaged file could ask for any memory."""
@@ -77,16 +77,16 @@ def _facts_of(search: Search, keep: Callable[[Any], str]) -> dict[str, Any]:
         **{name: getattr(probe, name) for name in numbers},
         **{name: getattr(search, name) for name in ("seed", "episodes", "rounds", "steps")},
         "random": search.random_state,
-        "controllers": [_facts_of_entrant(one, keep) for one in search.controllers],
-        "policies": [_facts_of_entrant(one, keep) for one in search.policies],
+        "controllers": [_facts_of_candidate_search(one, keep) for one in search.controllers],
+        "policies": [_facts_of_candidate_search(one, keep) for one in search.policies],
         "baseline": None if baseline is None else _place(baseline, search.controllers),
         "scale": keep(search.scale),
         "widths": search.widths,
     }
 
 
-def _place(entrant: Entrant, among: list[Entrant]) -> int:
-    return next(place for place, one in enumerate(among) if one is entrant)
+def _place(candidate_search: CandidateSearch, among: list[CandidateSearch]) -> int:
+    return next(place for place, one in enumerate(among) if one is candidate_search)
 
 
 def _facts_of_agent(
@@ -98,7 +98,7 @@ def _facts_of_agent(
     return facts | {"weights": keep(agent.weights), "scale": keep(agent.scale)}
 
 
-def _facts_of_entrant(one: Entrant, keep: Callable[[Any], str]) -> dict[str, Any]:
+def _facts_of_candidate_search(one: CandidateSearch, keep: Callable[[Any], str]) -> dict[str, Any]:
     return {
         "cma": None if one.cma is None else _facts_of_cma(one.cma, keep),
         **{name: _facts_of_agent(getattr(one, name), keep) for name in ("make", "then", "best")},
@@ -149,8 +149,10 @@ class _Reader:
             _count(facts[name], math.inf) for name in ("episodes", "rounds", "steps")
         )
         search.random_state = facts["random"]
-        search.controllers = [self._entrant(one, search) for one in _some(facts["controllers"])]
-        search.policies = [self._entrant(one, search) for one in facts["policies"]]
+        search.controllers = [
+            self._candidate_search(one, search) for one in _some(facts["controllers"])
+        ]
+        search.policies = [self._candidate_search(one, search) for one in facts["policies"]]
         place = facts["baseline"]
         search.baseline = None if place is None else search.controllers[_count(place)]
         search.scale = self._array(facts["scale"], 2, None)
@@ -193,12 +195,12 @@ class _Reader:
     def _optional_agent(self, facts: Mapping[str, Any] | None) -> ResidualAgent | None:
         return None if facts is None else self._agent(facts)
 
-    def _entrant(self, facts: Mapping[str, Any], search: Search) -> Entrant:
+    def _candidate_search(self, facts: Mapping[str, Any], search: Search) -> CandidateSearch:
         make = self._optional_agent(facts["make"])
         size = 0 if make is None else _size_of(make)
         first, leader = facts["first"], facts["leader"]
         counts = {name: _count(facts[name], math.inf) for name in _COUNTS}
-        return Entrant(
+        return CandidateSearch(
             None if facts["cma"] is None else self._cma(facts["cma"], size, search),
             make,
             then=self._optional_agent(facts["then"]),

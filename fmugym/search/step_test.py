@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.baselines.controller import Controller
 from fmugym.pool.base import FloatArray
 
@@ -151,42 +151,46 @@ def episodes_of(actions: int) -> int:
     return len(_POINTS) * (1 + 2 * actions)
 
 
-def step_test(arena: Arena, limits: Sequence[tuple[float, float]]) -> StepResponses:
+def step_test(
+    evaluator: CandidateEvaluator, limits: Sequence[tuple[float, float]]
+) -> StepResponses:
     """Step each action up and down at three operating points, beside an unstepped twin.
 
     All episodes have the same seed, so that noise and disturbances cancel in the differences. The
     actions are held from the beginning on.
 
     Args:
-        arena: Plays the episodes. They may be as long as ``arena.most_steps``.
+        evaluator: Plays the episodes. They may be as long as ``evaluator.most_steps``.
         limits: Those of each action.
     """
     count, (low, high) = len(limits), np.array(limits).T
     unit = np.eye(count)
     steps = np.concatenate([np.zeros((1, count)), unit, -unit])
     parts = np.concatenate([point + _STEP * steps for point in _POINTS])
-    names, courses = _played(arena, low + parts * (high - low))
+    names, courses = _played(evaluator, low + parts * (high - low))
     responses = []
     for first in range(0, len(courses), len(steps)):
         twin, *stepped = courses[first : first + len(steps)]
         found = np.array([_response(twin, one) / _STEP for one in stepped])
         responses += [found[:count], -found[count:]]
     ends = [one[-len(one) // _QUARTERS :].mean(axis=0) for one in courses]
-    early = np.mean([len(one) < arena.most_steps for one in courses])
+    early = np.mean([len(one) < evaluator.most_steps for one in courses])
     return StepResponses(names, np.array(responses), np.array(ends), bool(early > 0.5))
 
 
-def _played(arena: Arena, actions: FloatArray) -> tuple[tuple[str, ...], list[FloatArray]]:
+def _played(
+    evaluator: CandidateEvaluator, actions: FloatArray
+) -> tuple[tuple[str, ...], list[FloatArray]]:
     """Play an episode with each action; returns what is observed, each of shape (T, k)."""
     controllers: list[_Held] = []
     jobs = []
 
     def make(rows: FloatArray) -> Controller:
         controllers.append(_Held(rows))
-        jobs.append(arena.jobs)
+        jobs.append(evaluator.jobs)
         return controllers[-1]
 
-    lengths = arena.play(make, actions, [_SEED], has_moments=True).moments[:, 0, 0]
+    lengths = evaluator.play(make, actions, [_SEED], has_moments=True).moments[:, 0, 0]
     longest = max(len(one.rows) for one in controllers)
     rows = np.concatenate([one.course(longest) for one in controllers], axis=1)
     places = np.concatenate(jobs).tolist()

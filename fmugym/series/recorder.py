@@ -16,7 +16,7 @@ from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
-from fmugym.series.choice import RecordedEnvs, choose
+from fmugym.series.recorded_quantities import RecordedEnvs, choose
 from fmugym.series.rows import Infos, RecordedStep, RowMaker, batched_info
 from fmugym.series.store import MemoryStore, RowStore, open_store
 from fmugym.series.timeseries import TimeSeries

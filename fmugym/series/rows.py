@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.series.choice import RecordedEnvs, RecordedQuantities
+from fmugym.series.recorded_quantities import RecordedEnvs, RecordedQuantities
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 from fmugym.task.starting import start_time_of

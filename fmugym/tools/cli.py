@@ -83,21 +83,21 @@ from typing import Any, Final, NoReturn
 import argcomplete
 
 from fmugym.errors import FMUGymError, unknown_name
-from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
 from fmugym.tools.fitting import add_fit
-from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_validate
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import add_common, free_outputs, print_note, speaking
 from fmugym.tools.plants import add_serve
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
+from fmugym.tools.signal_handling import exit_code
 from fmugym.tools.standard_streams import (
     drop_output,
     escape_what_consoles_lack,
     keep_output_from_fmus,
     named,
 )
+from fmugym.tools.tune_command import add_tune
 
 __all__ = ["run_command_line"]
 

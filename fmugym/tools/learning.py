@@ -30,7 +30,6 @@ from fmugym.tools.targets import maker_of, scenarios_of
 from fmugym.tools.watching import watched
 from fmugym.training.agents import AGENT_FILE
 from fmugym.training.checkpoints import CHECKPOINT
-from fmugym.training.diary import Diary
 from fmugym.training.environments import fitting_envs
 from fmugym.training.hyperparameters import tune_hyperparameters
 from fmugym.training.outcome import write_curve, write_outcome
@@ -45,6 +44,7 @@ from fmugym.training.training import (
     facts_of,
     train,
 )
+from fmugym.training.training_records import TrainingRecords
 
 __all__ = ["add_train"]
 
@@ -270,7 +270,7 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
         normalize=arguments.normalize,
         arguments=own,
         residual=_residual_of(arguments, make_env, before.get("residual")),
-        diary=_diary_of(arguments, before.get("record")),
+        records=_records_of(arguments, before.get("record")),
     )
 
 
@@ -286,15 +286,15 @@ def _residual_of(
     return residual_facts(make_env, arguments.residual, scale, tell)
 
 
-def _diary_of(arguments: argparse.Namespace, before: Any) -> Diary | None:
+def _records_of(arguments: argparse.Namespace, before: Any) -> TrainingRecords | None:
     """What the options say to record; without any, what the training was begun with."""
     own = (arguments.record_env, arguments.record_every, arguments.record_format)
     if arguments.record is None:
         if any(one is not None for one in own):
             raise ConfigError("name the variables to record, too: --record '*'")
-        return Diary.of(before)
+        return TrainingRecords.of(before)
     environments = tuple(arguments.record_env or (0,))
-    return Diary(tuple(arguments.record), environments, own[1], own[2] or "csv")
+    return TrainingRecords(tuple(arguments.record), environments, own[1], own[2] or "csv")
 
 
 def _tuned(settings: TrainingSettings, arguments: argparse.Namespace) -> TrainingSettings:

@@ -16,7 +16,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.episodes.evaluation import aligned
 from fmugym.errors import FMULoadError, first_of, plain
-from fmugym.series.choice import matches
+from fmugym.series.recorded_quantities import matches
 from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "finite_or_none", "headed", "overview", "tables", "typed_start"]

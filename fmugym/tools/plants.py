@@ -18,8 +18,8 @@ from fmugym.episodes.progress_bars import progress_bar
 from fmugym.episodes.simulation import Summary, simulate
 from fmugym.errors import ConfigError, plain, shown
 from fmugym.plant import Server, connect
+from fmugym.plant.loopback_plant import with_plant
 from fmugym.plant.predicting import Error
-from fmugym.plant.proposing import with_plant
 from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
     Commands,

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fmugym.baselines.arena import most_steps_of
+from fmugym.baselines.candidate_evaluation import most_steps_of
 from fmugym.checks import Spellings
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table

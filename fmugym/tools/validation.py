@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.arena import most_steps_of
+from fmugym.baselines.candidate_evaluation import most_steps_of
 from fmugym.baselines.controller import Controller
 from fmugym.baselines.parsing import controller_of, has_range, plans_ahead, simple_controllers
 from fmugym.baselines.table import ControllerTable
@@ -34,7 +34,7 @@ from fmugym.fmi.words import asked_for
 from fmugym.pool.base import FloatArray
 from fmugym.search.probe import MOST_PROBED
 from fmugym.search.search import tuning_steps
-from fmugym.series.choice import quantities_of
+from fmugym.series.recorded_quantities import quantities_of
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import advise

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, ArenaResult
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, CandidateScores
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.search.policy import ResidualAgent
 from fmugym.series.intervals import confidence
@@ -18,7 +18,7 @@ __all__ = ["judge", "verdict"]
 
 def judge(
     agents: Mapping[str, ResidualAgent],
-    arenas: Mapping[str, Arena],
+    evaluators: Mapping[str, CandidateEvaluator],
     episodes: int,
     leave_out: Callable[[str, Exception], None],
     advance: Callable[[str, float], None] = lambda name, part: None,
@@ -27,7 +27,7 @@ def judge(
 
     Args:
         agents: By name.
-        arenas: Those of the scenarios, by name; they are closed.
+        evaluators: Those of the scenarios, by name; they are closed.
         episodes: How many episodes of each scenario.
         leave_out: Is told of an agent that cannot play to the end, or of a scenario that cannot be
             opened, by name and with the reason. The others play all the same.
@@ -39,28 +39,30 @@ def judge(
         ``mean_costs`` by name, with the part of ``failed episodes``, which a fault has cut short.
     """
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes)
-    played: dict[str, list[ArenaResult]] = {name: [] for name in agents}
+    played: dict[str, list[CandidateScores]] = {name: [] for name in agents}
     opened = []
-    for scenario, arena in arenas.items():
-        with closing(arena):
+    for scenario, evaluator in evaluators.items():
+        with closing(evaluator):
             try:
-                arena.open(len(seeds))
+                evaluator.open(len(seeds))
             except Exception as error:
-                leave_out(f"scenario {scenario}" if len(arenas) > 1 else scenario, error)
+                leave_out(f"scenario {scenario}" if len(evaluators) > 1 else scenario, error)
                 continue
             opened.append(scenario)
             for name in list(played):
-                arena.advance = lambda part, name=name: advance(name, part / len(arenas))  # type: ignore[misc]
+                evaluator.advance = lambda part, name=name: advance(name, part / len(evaluators))  # type: ignore[misc]
                 try:
-                    played[name].append(agents[name].play(arena, seeds))
+                    played[name].append(agents[name].play(evaluator, seeds))
                 except Exception as error:
                     leave_out(name, error)
                     del played[name]
-                    arena.close()  # its episodes are in the middle of something
+                    evaluator.close()  # its episodes are in the middle of something
     return _told(played if opened else {}, opened)
 
 
-def _told(played: Mapping[str, Sequence[ArenaResult]], scenarios: Sequence[str]) -> dict[str, Any]:
+def _told(
+    played: Mapping[str, Sequence[CandidateScores]], scenarios: Sequence[str]
+) -> dict[str, Any]:
     test = {}
     for name, outcomes in played.items():
         costs = np.mean([one.costs for one in outcomes], axis=(0, 1, 2)).tolist()

@@ -13,8 +13,8 @@ from typing import Any, Final
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
 from fmugym.training.agents import algorithm_of
-from fmugym.training.diary import append_row
 from fmugym.training.training import TRIALS, TrainingSettings, Watch, require_new, train
+from fmugym.training.training_records import append_row
 
 __all__ = ["tune_hyperparameters"]
 
@@ -97,7 +97,7 @@ def _best_reward(
             raise pruned
 
     folder = settings.folder / TRIALS / f"{trial.number:03}"
-    own = replace(settings, folder=folder, steps=steps, arguments=arguments, diary=None)
+    own = replace(settings, folder=folder, steps=steps, arguments=arguments, records=None)
     train(own, watch=Watch(evaluated=evaluated))
     return max(rewards)
 

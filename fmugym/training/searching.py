@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
-from fmugym.baselines.entrants import NO_MERIT
+from fmugym.baselines.candidate_evaluation import MOST_ENVS, CandidateEvaluator, CeilingError
+from fmugym.baselines.candidate_search import NO_MERIT
 from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
@@ -29,9 +29,9 @@ from fmugym.search.search_file import bytes_of, plain_of, search_in
 from fmugym.surrogate.courses import Courses
 from fmugym.training.agents import AGENT_FILE
 from fmugym.training.comparing import judge, verdict
-from fmugym.training.diary import append_row
 from fmugym.training.environments import VERY_SLOW
 from fmugym.training.training import require_new
+from fmugym.training.training_records import append_row
 from fmugym.training.twin import TwinSearch
 
 __all__ = ["STATE", "Searching"]
@@ -139,9 +139,11 @@ class Searching:
         self._probe, self._before = self._found.probe, self._found.steps
         self._tell_the_plan(resume)
         try:
-            with closing(self._arena_of(self.make_env, self._probe.most_steps)) as self._arena:
-                self._arena.steps = self._before
-                self._arena.backend = self._courses if self._on_surrogate else "auto"
+            with closing(
+                self._evaluator_of(self.make_env, self._probe.most_steps)
+            ) as self._evaluator:
+                self._evaluator.steps = self._before
+                self._evaluator.backend = self._courses if self._on_surrogate else "auto"
                 winner = self._winner()
             return self._judged(winner)
         finally:
@@ -180,11 +182,11 @@ class Searching:
             )
         return found
 
-    def _arena_of(self, make_env: Callable[[], Any], most_steps: int) -> Arena:
+    def _evaluator_of(self, make_env: Callable[[], Any], most_steps: int) -> CandidateEvaluator:
         seconds, group = self._probe.seconds, self.envs
         if seconds > _SLOW:
             group = min(group, _GROUP if seconds < VERY_SLOW else available_processors())
-        return Arena(make_env, group, most_steps, self._probe.limits)
+        return CandidateEvaluator(make_env, group, most_steps, self._probe.limits)
 
     def _tell_the_plan(self, is_resumed: bool) -> None:
         """Tell what will be done, and how long."""
@@ -241,8 +243,8 @@ class Searching:
             if self._found.ahead.merit > NO_MERIT:
                 self._save(self._found.ahead.best)
         self.tell(self._text())
-        self._arena.ceiling = self.steps
-        winner = self._found.winner(self._arena)
+        self._evaluator.ceiling = self.steps
+        winner = self._found.winner(self._evaluator)
         if winner is None:
             raise ConfigError(
                 f"{self._found.rounds} rounds are too few to find anything: give more --minutes, "
@@ -261,7 +263,7 @@ class Searching:
         steps = min(self.steps, _MOST_OF_FMU, self._before + left / 2 / self._probe.seconds)
         twin = TwinSearch(
             self._found,
-            self._arena,
+            self._evaluator,
             self._courses,
             self.steps if limited else steps,
             np.inf if limited else left,
@@ -284,18 +286,18 @@ class Searching:
         longest = 0.0
         while not self._is_over(longest):
             begin, before = monotonic(), self._found
-            self._arena.ceiling = self.steps - self._reserved(before)
+            self._evaluator.ceiling = self.steps - self._reserved(before)
             found = copy.deepcopy(before)
             try:
-                found.advance(self._arena)
+                found.advance(self._evaluator)
             except CeilingError:
                 return
-            if self._arena.steps > self.steps - self._reserved(found):
+            if self._evaluator.steps > self.steps - self._reserved(found):
                 return
             self._found = found
             ahead, base = found.ahead, found.baseline
             if base and (before.baseline is None or ahead.merit > before.ahead.merit):
-                row = self._arena.steps, ahead.merit[1], base.merit[1]
+                row = self._evaluator.steps, ahead.merit[1], base.merit[1]
                 append_row(self.folder, ("steps", "reward", "baseline"), row)
                 self._save(ahead.best)
             took = monotonic() - begin
@@ -313,9 +315,9 @@ class Searching:
         goes_on = self._is_enough or found.tuning or found.baseline
         if found.is_over or found.rounds >= self.rounds or not goes_on:
             return True
-        done, seconds = self._arena.steps - self._before, monotonic() - self._begin
+        done, seconds = self._evaluator.steps - self._before, monotonic() - self._begin
         # all episodes may end before they are as long as they may be
-        pace = seconds / (done or 1) * self._arena.longest / self._probe.most_steps
+        pace = seconds / (done or 1) * self._evaluator.longest / self._probe.most_steps
         return seconds + longest + self._reserved(found) * pace >= self.seconds
 
     def _text(self) -> str:
@@ -328,7 +330,7 @@ class Searching:
     def _save(self, agent: ResidualAgent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
         found, task = self._found, self._probe.task
-        found.steps = self._arena.steps
+        found.steps = self._evaluator.steps
         facts = {
             "algorithm": "search",
             "agent": agent.name,
@@ -354,36 +356,39 @@ class Searching:
         baseline = found.baseline.best if found.baseline else winner
         if found.baseline and winner is baseline:
             self.tell(f"nothing was found that beats {winner.name}: the folder has that controller")
-        arenas = {
-            name: self._arena_of(make, probe.most_steps if make is self.make_env else _LONGEST)
+        evaluators = {
+            name: self._evaluator_of(make, probe.most_steps if make is self.make_env else _LONGEST)
             for name, make in self.scenarios.items()
         }
-        usual = _EPISODES if len(arenas) < 2 else _OF_SCENARIO
+        usual = _EPISODES if len(evaluators) < 2 else _OF_SCENARIO
         count = 1 if probe.is_same else self.episodes or usual
         if self._on_surrogate and self.episodes is None and self.minutes:
-            most = self.seconds / _OF_TEST / probe.seconds / probe.most_steps / len(arenas)
+            most = self.seconds / _OF_TEST / probe.seconds / probe.most_steps / len(evaluators)
             count = min(count, max(_FEWEST_TESTED, int(most)))
         agents = {winner.name: winner}
-        planners = self._planners(baseline.text, count * len(arenas))
+        planners = self._planners(baseline.text, count * len(evaluators))
         others = (one.best for one in found.controllers)
         for other in filter(None, [baseline, *others, *planners]):
             agents.setdefault(other.name, other)
-        test = self._test(agents, arenas, count)
+        test = self._test(agents, evaluators, count)
         text = f"no verdict: {winner.name} could not play the test"
         if winner.name in test:
             text = verdict(test, probe.limits)
         return self._save(winner, test=test, verdict=text)
 
     def _test(
-        self, agents: Mapping[str, ResidualAgent], arenas: Mapping[str, Arena], count: int
+        self,
+        agents: Mapping[str, ResidualAgent],
+        evaluators: Mapping[str, CandidateEvaluator],
+        count: int,
     ) -> dict[str, Any]:
         """Let agents play, and show how far they are; nothing that one does ends the test."""
-        usual = self._probe.seconds * self._probe.usual_steps * count * len(arenas)
+        usual = self._probe.seconds * self._probe.usual_steps * count * len(evaluators)
         seconds = {name: self._seconds_of.get(name, usual) for name in agents}
         with self.progress(sum(seconds.values()), "test") as advance:
             return judge(
                 agents,
-                arenas,
+                evaluators,
                 count,
                 self._leave_out,
                 lambda name, part: advance(part * seconds[name]),
@@ -406,12 +411,12 @@ class Searching:
                 continue
             try:
                 agent = ResidualAgent(name, warmed(text, baseline))
-                with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
-                    agent.play(arena, range(1))
+                with closing(CandidateEvaluator(self.make_env, most_steps=_TRIED)) as evaluator:
+                    agent.play(evaluator, range(1))
             except Exception as error:
                 self._leave_out(name, error)
                 continue
-            seconds = arena.seconds / arena.steps * self._probe.most_steps * episodes
+            seconds = evaluator.seconds / evaluator.steps * self._probe.most_steps * episodes
             if seconds <= 60.0 * (self.minutes or _MINUTES):
                 self._seconds_of[name] = seconds
                 yield agent

@@ -47,9 +47,9 @@ from fmugym.training.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, append_row
 from fmugym.training.residuals import begin_at_zero, residual_of
 from fmugym.training.tracking import Tracker
+from fmugym.training.training_records import EVALUATIONS, RECORDS, TrainingRecords, append_row
 from fmugym.vector import FMUVectorEnv
 
 __all__ = [
@@ -87,7 +87,7 @@ class TrainingSettings:
             with other ranges are scaled to -1 to 1 in any case.
         arguments: Arguments of the algorithm.
         residual: Which controller's action it adds to, see ``residual_facts``; None for none.
-        diary: What to record; None for nothing.
+        records: What to record; None for nothing.
     """
 
     make_env: Callable[..., FMUEnv]
@@ -102,7 +102,7 @@ class TrainingSettings:
     normalize: bool = True
     arguments: Mapping[str, Any] | None = None
     residual: Mapping[str, Any] | None = None
-    diary: Diary | None = None
+    records: TrainingRecords | None = None
 
     def facts(self) -> dict[str, Any]:
         """What a training that is resumed must have in common with its beginning."""
@@ -220,10 +220,10 @@ def _normalized(venv: Any) -> Any:
 
 def _recorder(settings: TrainingSettings, resume: bool) -> Callable[[FMUVectorEnv], Any]:
     """What wraps the environments of a training."""
-    if settings.diary is None:
+    if settings.records is None:
         return lambda envs: envs
     begin = latest_checkpoint(settings.folder)[1] if resume else 0
-    return settings.diary.of_training(settings.folder, begin)
+    return settings.records.of_training(settings.folder, begin)
 
 
 def _check_arguments(settings: TrainingSettings) -> None:
@@ -321,9 +321,9 @@ class _Training:
             self._tell_of_the_plan()
             settings.folder.mkdir(parents=True, exist_ok=True)
         facts: dict[str, Any] = {"schema": 1, "steps": settings.steps, **settings.facts()}
-        if settings.diary is not None:
+        if settings.records is not None:
             (settings.folder / RECORDS).mkdir(exist_ok=True)
-            facts["record"] = settings.diary.facts()
+            facts["record"] = settings.records.facts()
         write_whole(settings.folder / TRAINING, json.dumps(facts).encode())
         self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
         self._begin = self._told = self._steps
@@ -483,9 +483,9 @@ class _Training:
     def _wrap(self, name: str) -> Wrap:
         """What wraps the environment of an evaluation."""
         settings = self._settings
-        if settings.diary is None:
+        if settings.records is None:
             return lambda env: env
-        return settings.diary.of_evaluation(settings.folder, self._steps, name)
+        return settings.records.of_evaluation(settings.folder, self._steps, name)
 
     def _normalization(self) -> Any:
         return self._venv if hasattr(self._venv, "normalize_obs") else None

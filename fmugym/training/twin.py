@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Final, NamedTuple
 
-from fmugym.baselines.arena import Arena, ArenaResult, Merit
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, CandidateScores, Merit
 from fmugym.errors import ConfigError
 from fmugym.search.excitation import excite
 from fmugym.search.policy import ResidualAgent
@@ -62,7 +62,7 @@ class Proof(NamedTuple):
 
     agent: ResidualAgent
     seeds: Sequence[int]
-    measured: ArenaResult
+    measured: CandidateScores
 
 
 class Standing(NamedTuple):
@@ -83,7 +83,7 @@ class TwinSearch:
 
     Attributes:
         found: The search.
-        arena: The FMU's; its courses are kept.
+        evaluator: The FMU's; its courses are kept.
         courses: What the FMU has done.
         steps: How many steps of the FMU there may be.
         seconds: The real time that is left.
@@ -94,7 +94,7 @@ class TwinSearch:
     """
 
     found: Search
-    arena: Arena
+    evaluator: CandidateEvaluator
     courses: Courses
     steps: float
     seconds: float
@@ -106,9 +106,9 @@ class TwinSearch:
 
     def __post_init__(self) -> None:
         self._end = monotonic() + self.seconds
-        most, left = self.found.probe.most_steps, self.steps - self.arena.steps
+        most, left = self.found.probe.most_steps, self.steps - self.evaluator.steps
         self.length = int(min(most, max(left // _DIVIDED, min(most / 2, left // _FEWEST_PLAYED))))
-        self.arena.most_steps = self.length
+        self.evaluator.most_steps = self.length
 
     def winner(self) -> ResidualAgent:
         """The best agent.
@@ -122,10 +122,10 @@ class TwinSearch:
                 "for a surrogate: give more --minutes or --steps"
             )
         count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
-        excite(self.arena, self.courses, self.found.probe, count, self.found.rng)
+        excite(self.evaluator, self.courses, self.found.probe, count, self.found.rng)
         for cycle in range(_CYCLES):
             surrogate = self._fitted()
-            with closing(self._arena_on(surrogate)) as twin:
+            with closing(self._evaluator_on(surrogate)) as twin:
                 if cycle:
                     self.found.revalidate(twin)
                 self._search(twin, cycle)
@@ -149,17 +149,19 @@ class TwinSearch:
     def _fitted(self) -> Surrogate:
         found = fit(self.courses)
         self.tell(
-            f"surrogate of {self.arena.steps} steps: {found.terms.form}; simulations are wrong by "
-            f"{100 * found.error:.2g} % of what outputs vary"
+            f"surrogate of {self.evaluator.steps} steps: {found.terms.form}; simulations are "
+            f"wrong by {100 * found.error:.2g} % of what outputs vary"
         )
         return found
 
-    def _arena_on(self, surrogate: Surrogate) -> Arena:
+    def _evaluator_on(self, surrogate: Surrogate) -> CandidateEvaluator:
         """Where the surrogate plays, whole episodes."""
         probe = self.found.probe
-        return Arena(self.arena.make_env, _MANY, probe.most_steps, probe.limits, backend=surrogate)
+        return CandidateEvaluator(
+            self.evaluator.make_env, _MANY, probe.most_steps, probe.limits, backend=surrogate
+        )
 
-    def _search(self, twin: Arena, cycle: int) -> None:
+    def _search(self, twin: CandidateEvaluator, cycle: int) -> None:
         found, left = self.found, self._end - monotonic()
         until = monotonic() + left / 2
         last = min(self.rounds, found.rounds + (_MORE if cycle else _FIRST))
@@ -180,7 +182,7 @@ class TwinSearch:
     @property
     def _left(self) -> int:
         """How many agents may be proved with the steps that are left."""
-        return int((self.steps - self.arena.steps) // (self.length * self._episodes))
+        return int((self.steps - self.evaluator.steps) // (self.length * self._episodes))
 
     def _prove(self) -> None:
         """Let the baseline and the best policies play on the FMU."""
@@ -194,13 +196,13 @@ class TwinSearch:
             agents.insert(0, base.best)
         for agent in agents[: self._left]:
             seeds = range(_PROVED, _PROVED + self._episodes)
-            self.proofs.append(Proof(agent, seeds, agent.play(self.arena, seeds)))
+            self.proofs.append(Proof(agent, seeds, agent.play(self.evaluator, seeds)))
 
-    def _values(self, twin: Arena) -> list[Standing]:
+    def _values(self, twin: CandidateEvaluator) -> list[Standing]:
         """How good the agents are that have played on the FMU."""
         return [self._value(one, twin) for one in self.proofs]
 
-    def _value(self, proof: Proof, twin: Arena) -> Standing:
+    def _value(self, proof: Proof, twin: CandidateEvaluator) -> Standing:
         most = twin.most_steps
         twin.most_steps = self.length
         same = proof.agent.play(twin, proof.seeds)

@@ -10,7 +10,7 @@ import pytest
 
 import fmugym
 from fmugym.baselines import MPC
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.baselines.table_texts import table_in
 from fmugym.search.policy import ResidualAgent
 from fmugym.tools import watching
@@ -107,9 +107,9 @@ class TestTrain:
     def test_the_folder_comes_although_the_agent_itself_fails(
         self, error, written, tmp_path, cli, monkeypatch
     ):
-        def play(agent, arena, seeds):
+        def play(agent, evaluator, seeds):
             if not agent.acting:
-                return real(agent, arena, seeds)
+                return real(agent, evaluator, seeds)
             raise error("it has failed")
 
         real, judged = ResidualAgent.play, searching.judge
@@ -139,7 +139,7 @@ class TestTrain:
         told, parts = [], []
         found = judge(
             agents,
-            {"frost": Arena(fails), "spring": Arena(make)},
+            {"frost": CandidateEvaluator(fails), "spring": CandidateEvaluator(make)},
             2,
             lambda name, error: told.append((name, str(error))),
             lambda name, part: parts.append((name, part)),
@@ -254,8 +254,12 @@ class TestProgress:
 def test_groups_are_parts_of_a_whole():
     """Ten episodes of three candidates in four environments."""
     parts = []
-    arena = Arena(lambda: fmugym.load(fmugym.Task.from_dict(ONE)), 4, advance=parts.append)
+    evaluator = CandidateEvaluator(
+        lambda: fmugym.load(fmugym.Task.from_dict(ONE)), 4, advance=parts.append
+    )
     numbers = np.zeros((3, 1))
-    arena.play(lambda rows: ResidualAgent("0", "schedule 00:00=0")(rows[:, :0]), numbers, range(10))
-    arena.close()
+    evaluator.play(
+        lambda rows: ResidualAgent("0", "schedule 00:00=0")(rows[:, :0]), numbers, range(10)
+    )
+    evaluator.close()
     assert sum(parts) == pytest.approx(1.0)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.search.policy import POLICY_FILE, ResidualAgent
 from fmugym.search.search import Search
 from fmugym.series.intervals import confidence
@@ -117,22 +117,22 @@ class Interruption:
     """Ctrl-C after some rounds, or within the next one."""
 
     def __init__(self, monkeypatch, rounds, *, within=False):
-        self.rounds, self.now, advance, play = rounds, -1, Search.advance, Arena.play
+        self.rounds, self.now, advance, play = rounds, -1, Search.advance, CandidateEvaluator.play
 
-        def advanced(search, arena):
+        def advanced(search, evaluator):
             if not within and search.rounds >= self.rounds:
                 raise KeyboardInterrupt
             self.now = search.rounds
-            advance(search, arena)
+            advance(search, evaluator)
 
-        def played(arena, *arguments, **options):
-            outcome = play(arena, *arguments, **options)
+        def played(evaluator, *arguments, **options):
+            outcome = play(evaluator, *arguments, **options)
             if within and self.now >= self.rounds:
                 raise KeyboardInterrupt
             return outcome
 
         monkeypatch.setattr(Search, "advance", advanced)
-        monkeypatch.setattr(Arena, "play", played)
+        monkeypatch.setattr(CandidateEvaluator, "play", played)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The search for policies: its steps against known optima, and what policies and arenas do."""
+"""The search for policies: its steps against known optima, and what policies and evaluators do."""
 
 import itertools
 import json
@@ -19,9 +19,14 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.baselines import PID, controller_of
 from fmugym.baselines import cma as covariance
-from fmugym.baselines.arena import MOST_STEPS, Arena, ArenaResult, CeilingError
+from fmugym.baselines.candidate_evaluation import (
+    MOST_STEPS,
+    CandidateEvaluator,
+    CandidateScores,
+    CeilingError,
+)
+from fmugym.baselines.candidate_search import CandidateSearch
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import search_of
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
@@ -223,8 +228,8 @@ SEEDS = [3, 700_000, 41]
 
 
 def played(make_env, make=pid, numbers=GAINS, seeds=SEEDS, **arguments):
-    with closing(Arena(make_env, **arguments)) as arena:
-        return arena.play(make, numbers, seeds), arena
+    with closing(CandidateEvaluator(make_env, **arguments)) as evaluator:
+        return evaluator.play(make, numbers, seeds), evaluator
 
 
 class TestArena:
@@ -249,20 +254,20 @@ class TestArena:
         """Where there may be no more of them, a few episodes play in many environments."""
         opened = []
         make = load()
-        with closing(Arena(lambda: opened.append(1) or make(), 15)) as arena:
+        with closing(CandidateEvaluator(lambda: opened.append(1) or make(), 15)) as evaluator:
             for _ in range(3):
-                arena.play(pid, GAINS, SEEDS)
-                arena.play(pid, GAINS[:1], SEEDS[:1])
+                evaluator.play(pid, GAINS, SEEDS)
+                evaluator.play(pid, GAINS[:1], SEEDS[:1])
             first = len(opened)
-            arena.play(pid, GAINS, SEEDS)
+            evaluator.play(pid, GAINS, SEEDS)
             assert len(opened) == first
-            assert arena._envs.num_envs == 15
+            assert evaluator._envs.num_envs == 15
 
     def test_a_second_play_is_like_the_first(self):
-        with closing(Arena(load())) as arena:
-            first = arena.play(pid, GAINS, SEEDS)
-            arena.play(pid, GAINS[:1], [1])
-            assert arena.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
+        with closing(CandidateEvaluator(load())) as evaluator:
+            first = evaluator.play(pid, GAINS, SEEDS)
+            evaluator.play(pid, GAINS[:1], [1])
+            assert evaluator.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
 
     @pytest.mark.parametrize("most_envs", [512, 7])
     @pytest.mark.parametrize("kind", ["arrays", "one by one", "process"])
@@ -281,29 +286,29 @@ class TestArena:
                 for seed in SEEDS:
                     controller.reset()
                     lengths.append(episode(env, controller, seed)[2])
-        with closing(Arena(make, most_envs, limits={"effort": 1.0})) as arena:
-            outcome = arena.play(pid, GAINS, SEEDS)
-            stepped = arena._envs.health["steps"].sum()
-        assert stepped == arena.steps == sum(lengths)
+        with closing(CandidateEvaluator(make, most_envs, limits={"effort": 1.0})) as evaluator:
+            outcome = evaluator.play(pid, GAINS, SEEDS)
+            stepped = evaluator._envs.health["steps"].sum()
+        assert stepped == evaluator.steps == sum(lengths)
         assert len(set(lengths)) > 3
         expected, _ = played(load(), limits={"effort": 1.0})
         assert outcome.returns == pytest.approx(expected.returns, rel=1e-12)
         assert outcome.costs == pytest.approx(expected.costs, rel=1e-12)
 
     def test_the_ceiling_holds(self):
-        with closing(Arena(load(terminated=None))) as arena:
-            arena.ceiling = 15 * 40 + 70
-            arena.play(pid, GAINS, SEEDS)
+        with closing(CandidateEvaluator(load(terminated=None))) as evaluator:
+            evaluator.ceiling = 15 * 40 + 70
+            evaluator.play(pid, GAINS, SEEDS)
             with pytest.raises(CeilingError, match="670"):
-                arena.play(pid, GAINS, SEEDS)
-            assert arena.steps == 15 * 44
+                evaluator.play(pid, GAINS, SEEDS)
+            assert evaluator.steps == 15 * 44
 
     def test_episodes_without_an_end_are_stopped(self):
         endless = load(terminated=None, episode_length=None, reward=1, costs=None)
         outcome, _ = played(endless, numbers=GAINS[:1], seeds=[0])
         assert outcome.returns.item() == MOST_STEPS == 10_000
-        outcome, arena = played(endless, numbers=GAINS[:2], seeds=[0], most_steps=7)
-        assert (outcome.returns.ravel().tolist(), arena.steps) == ([7, 7], 14)
+        outcome, evaluator = played(endless, numbers=GAINS[:2], seeds=[0], most_steps=7)
+        assert (outcome.returns.ravel().tolist(), evaluator.steps) == ([7, 7], 14)
 
 
 def episode(env, controller, seed, costs=()):
@@ -326,10 +331,10 @@ def test_costs_beyond_their_limits_come_first():
     """Returns 5, 9, 7, 1; two costs, of which the second has no room at all; no faults."""
     costs = np.array([[[1.0, 0.0, 0]], [[4.0, 0.0, 0]], [[2.0, 0.5, 0]], [[2.0, -1.0, 0]]])
     returns = np.array([[5.0], [9.0], [7.0], [1.0]])
-    merits = ArenaResult(returns, costs, {"a": 2.0, "b": 0.0}, NOTHING).merits
+    merits = CandidateScores(returns, costs, {"a": 2.0, "b": 0.0}, NOTHING).merits
     assert merits == [(0.0, 5.0), (-1.0, 9.0), (-0.5, 7.0), (0.0, 1.0)]
     assert sorted(range(4), key=merits.__getitem__, reverse=True) == [0, 3, 2, 1]
-    without = ArenaResult(returns, costs[..., 2:], {}, NOTHING).merits
+    without = CandidateScores(returns, costs[..., 2:], {}, NOTHING).merits
     assert [merit for _, merit in without] == [5, 9, 7, 1]
 
 
@@ -337,7 +342,7 @@ def test_what_is_no_number_comes_last():
     """Neither a NaN among the rewards nor one among the costs has an order."""
     returns = np.array([[np.nan, 9.0], [-1e9, -1e9], [7.0, 7.0], [1.0, 1.0]])
     costs = np.array([[[0.0, 0]] * 2, [[9.0, 0]] * 2, [[np.nan, 0], [0, 0]], [[0.0, 0]] * 2])
-    merits = ArenaResult(returns, costs, {"a": 1.0}, NOTHING).merits
+    merits = CandidateScores(returns, costs, {"a": 1.0}, NOTHING).merits
     for order in itertools.permutations(range(4)):
         assert sorted(order, key=merits.__getitem__, reverse=True)[:2] == [3, 1]
 
@@ -345,14 +350,14 @@ def test_what_is_no_number_comes_last():
 def test_a_search_among_what_is_no_number_goes_on():
     """All its first candidates reach NaN."""
     rng = np.random.default_rng(0)
-    entrant = Entrant(CMA(np.zeros(2), 1.0, 8, rng), ResidualAgent("own"), 2)
+    candidate_search = CandidateSearch(CMA(np.zeros(2), 1.0, 8, rng), ResidualAgent("own"), 2)
     for most in (np.nan, 1.0):
         for _ in range(5):
-            entrant.play(Field(most), range(2))
-        entrant.validate(Field(most), range(2))
-        assert entrant.best is not None
-    assert np.isfinite(entrant.merit).all()
-    assert entrant.best.weights.shape == (2,)
+            candidate_search.play(Field(most), range(2))
+        candidate_search.validate(Field(most), range(2))
+        assert candidate_search.best is not None
+    assert np.isfinite(candidate_search.merit).all()
+    assert candidate_search.best.weights.shape == (2,)
 
 
 @pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
@@ -711,9 +716,9 @@ def test_a_process_that_constants_drive_away_can_be_controlled(tmp_path):
         feedback = SimpleNamespace(act=lambda x, _: np.clip(-gains @ x, -1, 1))
         by_feedback, _, _ = episode(env, feedback, 0)
     search = Search(Probe.of(make, 256, print), 0)
-    with closing(Arena(make)) as arena:
+    with closing(CandidateEvaluator(make)) as evaluator:
         while search.rounds < 60:
-            search.advance(arena)
+            search.advance(evaluator)
     assert search.ahead.merit[1] > 1.7 * by_feedback
 
 
@@ -726,8 +731,8 @@ def test_a_scale_is_that_of_all_features(env):
     make = form
     scales = []
     for most_envs in (3, 512):
-        with closing(Arena(load(), most_envs)) as arena:
-            moments = arena.play(make, rows, SEEDS, has_moments=True).moments.sum(axis=(0, 1))
+        with closing(CandidateEvaluator(load(), most_envs)) as evaluator:
+            moments = evaluator.play(make, rows, SEEDS, has_moments=True).moments.sum(axis=(0, 1))
             scales.append(scale_of(moments))
     assert np.array_equal(*scales)
     for weights in rows:
@@ -763,7 +768,7 @@ def test_a_linear_policy_can_be_extended_by_a_history():
 
 
 class Field:
-    """Stands for an arena in which candidates reach what their numbers add up to, up to a limit."""
+    """An evaluator in whose place candidates reach what their numbers add up to, up to a limit."""
 
     def __init__(self, most):
         self.most = most
@@ -771,7 +776,7 @@ class Field:
     def play(self, make, numbers, seeds, has_moments=False):
         returns = np.repeat(np.minimum(numbers.sum(axis=1), self.most)[:, None], len(seeds), axis=1)
         seen = np.ones((*returns.shape, 1 + 2 * 7))
-        return ArenaResult(returns, np.zeros((*returns.shape, 1)), {}, seen)
+        return CandidateScores(returns, np.zeros((*returns.shape, 1)), {}, seen)
 
 
 class Needle(Field):
@@ -781,7 +786,7 @@ class Needle(Field):
         near = np.maximum(0.0, 1.0 - np.linalg.norm(numbers - 1.0, axis=1))
         chance = np.random.default_rng(list(seeds)).normal(0.0, 1e-3, (len(numbers), len(seeds)))
         returns = near[:, None] + chance
-        return ArenaResult(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
+        return CandidateScores(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
 
 
 def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
@@ -790,17 +795,17 @@ def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
     for seed in range(30):
         rng = np.random.default_rng(seed)
         cma = CMA(np.zeros(4), 1.0, 32, rng, largest=30.0, growth=5.0)
-        entrant, field = Entrant(cma, ResidualAgent("own"), 4), Needle(1.0)
+        candidate_search, field = CandidateSearch(cma, ResidualAgent("own"), 4), Needle(1.0)
         for _ in range(12):
             for _ in range(5):
-                entrant.play(field, rng.integers(1000, size=4))
-            entrant.validate(field, range(VALIDATION, VALIDATION + 8))
-        found.append(entrant.merit[1] > 0.5)
+                candidate_search.play(field, rng.integers(1000, size=4))
+            candidate_search.validate(field, range(VALIDATION, VALIDATION + 8))
+        found.append(candidate_search.merit[1] > 0.5)
     assert sum(found) >= 25
 
 
 class Noisy:
-    """Stands for an arena and for a search whose candidates are always as different."""
+    """Stands for an evaluator and for a search whose candidates are always as different."""
 
     mean = np.zeros(1)
 
@@ -815,7 +820,7 @@ class Noisy:
 
     def play(self, make, numbers, seeds, has_moments=False):
         returns = numbers + self.rng.normal(0.0, self.noise, (400, len(seeds)))
-        return ArenaResult(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
+        return CandidateScores(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
 
 
 @pytest.mark.parametrize(
@@ -826,10 +831,10 @@ class Noisy:
 def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noise, expected):
     """The means of two episodes correlate by 1 / (1 + variance / 2), those of four by more."""
     field = Noisy(noise)
-    entrant = Entrant(field, None, 4)
+    candidate_search = CandidateSearch(field, None, 4)
     for _ in range(120):
-        entrant.play(field, range(entrant.episodes))
-    assert entrant.episodes == expected
+        candidate_search.play(field, range(candidate_search.episodes))
+    assert candidate_search.episodes == expected
 
 
 GIVEN = ResidualAgent("given", "pid of=theta setpoint=0 kp=1")
@@ -929,9 +934,9 @@ class TestAgent:
         assert replace(loaded, weights=(), scale=(), names=self.NAMES) == replace(
             agent, weights=(), scale=()
         )
-        with closing(Arena(load())) as arena:
-            expected = agent.play(arena, SEEDS)
-            assert loaded.play(arena, SEEDS).returns.tolist() == expected.returns.tolist()
+        with closing(CandidateEvaluator(load())) as evaluator:
+            expected = agent.play(evaluator, SEEDS)
+            assert loaded.play(evaluator, SEEDS).returns.tolist() == expected.returns.tolist()
 
     def test_damaged_files(self, agent, tmp_path):
         """Shorter ones, others, and those with one wrong byte, which may be where nobody looks."""
@@ -1124,11 +1129,11 @@ class TestSearch:
         assert content(folder) != content(usual[0])
 
     def test_training_validation_and_test_never_share_episodes(self, folder, monkeypatch):
-        calls, play = [], Arena.play
+        calls, play = [], CandidateEvaluator.play
         monkeypatch.setattr(
-            Arena,
+            CandidateEvaluator,
             "play",
-            lambda arena, *rest, **more: calls.append(rest) or play(arena, *rest, **more),
+            lambda evaluator, *rest, **more: calls.append(rest) or play(evaluator, *rest, **more),
         )
         searched(folder)
         _, *calls = calls  # the first one was a look at the task
@@ -1144,13 +1149,13 @@ class TestSearch:
         assert firsts == sorted(firsts)  # the test is played once, at the end
 
     def test_equal_episodes_are_played_once(self, folder, monkeypatch):
-        counts, told, play = [], [], Arena.play
+        counts, told, play = [], [], CandidateEvaluator.play
 
-        def spy(arena, make, numbers, seeds, **options):
+        def spy(evaluator, make, numbers, seeds, **options):
             counts.append(len(seeds))
-            return play(arena, make, numbers, seeds, **options)
+            return play(evaluator, make, numbers, seeds, **options)
 
-        monkeypatch.setattr(Arena, "play", spy)
+        monkeypatch.setattr(CandidateEvaluator, "play", spy)
         parameters = {"q_0": "pi", "theta_0": 0.5}
         facts = searched(folder, parameters=parameters, told=told)
         assert counts[0] > 1  # how it knows, and how quick a step is
@@ -1279,7 +1284,9 @@ class TestBudget:
         facts = []
         for seconds, envs in ((100.0, 512), (0.0, 512), (0.0, 11)):
             clock = itertools.count(step=seconds)
-            monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
+            monkeypatch.setattr(
+                "fmugym.baselines.candidate_evaluation.perf_counter", clock.__next__
+            )
             folder = tmp_path / str(len(facts))
             limits = {"rounds": np.inf, "minutes": 1e9, "steps": 20_000, "envs": envs}
             facts.append(searched(folder, **limits) | {"steps": None})
@@ -1331,10 +1338,10 @@ class TestBudget:
         monkeypatch.setattr(Probe, "round_time", lambda *_: 1.0)
         monkeypatch.setattr(twin, "_is_close", lambda *_: False)
 
-        def interrupted(self, arena, cycle):
+        def interrupted(self, evaluator, cycle):
             if cycle == cycles:
                 raise KeyboardInterrupt
-            search(self, arena, cycle)
+            search(self, evaluator, cycle)
 
         monkeypatch.setattr(TwinSearch, "_search", interrupted)
         with pytest.raises(KeyboardInterrupt):
@@ -1355,7 +1362,9 @@ class TestProbe:
         found, told = [], []
         for seconds in (100.0, 0.0):
             clock = itertools.count(step=seconds)
-            monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
+            monkeypatch.setattr(
+                "fmugym.baselines.candidate_evaluation.perf_counter", clock.__next__
+            )
             found.append(Probe.of(load(parameters=HIDDEN), envs, told.append))
         slow, fast = found
         assert slow.seconds > fast.seconds

@@ -22,8 +22,8 @@ from fmugym.vector import FMUVectorEnv
 __all__ = [
     "MOST_ENVS",
     "MOST_STEPS",
-    "Arena",
-    "ArenaResult",
+    "CandidateEvaluator",
+    "CandidateScores",
     "CeilingError",
     "Merit",
     "most_steps_of",
@@ -45,10 +45,10 @@ def most_steps_of(env: FMUEnv) -> int | None:
 
 
 class CeilingError(FMUGymError):
-    """An arena may not take more steps."""
+    """An evaluator may not take more steps."""
 
 
-class ArenaResult(NamedTuple):
+class CandidateScores(NamedTuple):
     """What n candidates have reached in k episodes.
 
     Attributes:
@@ -86,7 +86,7 @@ class ArenaResult(NamedTuple):
 
 
 @dataclass
-class Arena:
+class CandidateEvaluator:
     """A vector environment in which candidates play the same episodes.
 
     The environments are made when they are needed, and again when more of them are. Where
@@ -136,7 +136,7 @@ class Arena:
         numbers: FloatArray,
         seeds: Sequence[int],
         has_moments: bool = False,
-    ) -> ArenaResult:
+    ) -> CandidateScores:
         """Let candidates play.
 
         Args:
@@ -166,7 +166,7 @@ class Arena:
             groups.append(totals[:, places])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
         costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
-        return ArenaResult(totals[0], costs, self.limits, moments)
+        return CandidateScores(totals[0], costs, self.limits, moments)
 
     def open(self, jobs: int) -> FMUVectorEnv:
         """Make the environments for so many episodes, unless there are enough.

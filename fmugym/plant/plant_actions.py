@@ -16,10 +16,10 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
 from fmugym.task.hooks import AssignedHook
 
-__all__ = ["Written"]
+__all__ = ["PlantActions"]
 
 
-class Written:
+class PlantActions:
     """What acts in a plant, in the place of what an environment would write.
 
     Args:

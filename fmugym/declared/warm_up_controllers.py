@@ -12,7 +12,7 @@ from gymnasium import spaces
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.variables import TaskVariable
-from fmugym.declared.warming import WARM_UP_CLOCK
+from fmugym.declared.warm_up_table import WARM_UP_CLOCK
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of
@@ -49,7 +49,7 @@ def _described(graph: Graph, roots: Sequence[int]) -> list[Any]:
     return described
 
 
-class Pilot:
+class WarmUpControllers:
     """The controllers of a warm-up and their actions.
 
     Args:
@@ -154,8 +154,10 @@ class DeclaredWarmUp(WarmUp):
         self.caches = table.caches
         self._inputs, self._update = function_of(tuple(inputs)), update
         self.writes = tuple(written)
-        self._pilot = None if table.controllers is None else Pilot(naming, table.controllers)
-        measured = [] if self._pilot is None else self._pilot.values
+        self._controllers = (
+            None if table.controllers is None else WarmUpControllers(naming, table.controllers)
+        )
+        measured = [] if self._controllers is None else self._controllers.values
         parts = [inputs, measured, *written.values()]
         roots = [value.node for part in (*parts, [naming.clock]) for value in part]
         needed = naming.graph.needed(roots)
@@ -170,13 +172,13 @@ class DeclaredWarmUp(WarmUp):
 
     def begin(self, count: int) -> None:
         """See ``WarmUp.begin``."""
-        if self._pilot is not None:
-            self._pilot.bind(count, self._time_step)
+        if self._controllers is not None:
+            self._controllers.bind(count, self._time_step)
 
     def inputs(self, env: Any) -> Any:
         """See ``WarmUp.inputs``; the controllers act first."""
         env.previous_action, env.action = env.action, np.array(env.action)
-        chosen = {} if self._pilot is None else self._pilot.act(env)
+        chosen = {} if self._controllers is None else self._controllers.act(env)
         for place, value in chosen.items():
             env.action[place if env.action.ndim > 1 else ...] = value
         return self._inputs(env)

@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, Merit
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, Merit
 from fmugym.pool.base import FloatArray
 
-__all__ = ["NO_MERIT", "Entrant"]
+__all__ = ["NO_MERIT", "CandidateSearch"]
 
 NO_MERIT: Final[Merit] = (-math.inf, -math.inf)
 
@@ -26,7 +26,7 @@ if few rounds counted."""
 
 
 @dataclass
-class Entrant:
+class CandidateSearch:
     """One search, and what has come of it.
 
     Attributes:
@@ -63,14 +63,14 @@ class Entrant:
     agreement: float = 1.0
     last_round: int = 0
 
-    def play(self, arena: Arena, seeds: Sequence[int]) -> Merit:
+    def play(self, evaluator: CandidateEvaluator, seeds: Sequence[int]) -> Merit:
         """Do a round, and return the merit of its best candidate.
 
         Ranks decide, so that the scale of rewards does not matter.
         """
         first, self.first = self.first, None
         found = self.cma.ask() if first is None else first
-        outcome = arena.play(self.make, found, seeds)
+        outcome = evaluator.play(self.make, found, seeds)
         best = outcome.order[0]
         if first is None:
             self.cma.tell(np.array(outcome.order))
@@ -105,13 +105,13 @@ class Entrant:
         if 1 < self.episodes < _MOST_EPISODES:
             self.episodes *= 2
 
-    def validate(self, arena: Arena, seeds: Sequence[int]) -> None:
+    def validate(self, evaluator: CandidateEvaluator, seeds: Sequence[int]) -> None:
         """Let the mean of the search and the leader play; the better one is kept if it is the best.
 
         The search goes on from the leader if that is better: where most candidates reach the same,
         their mean does not come near the few that reach more.
         """
-        merits = arena.play(self.make, np.stack([self.cma.mean, self.leader]), seeds).merits
+        merits = evaluator.play(self.make, np.stack([self.cma.mean, self.leader]), seeds).merits
         if merits[1] > merits[0]:
             self.cma.mean = self.leader
         if not max(merits) <= self.merit:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fmugym.declared.naming import Moment, Naming
-from fmugym.declared.parts import Term
+from fmugym.declared.section_entries import Term
 from fmugym.expressions.by_numpy import function_of
 from fmugym.expressions.language import CONSTANTS, Expression
 from fmugym.expressions.value import Value

@@ -23,7 +23,7 @@ __all__ = [
     "EVALUATIONS",
     "RECORDS",
     "REPORT",
-    "Diary",
+    "TrainingRecords",
     "append_row",
     "curve_of",
     "draw_curve",
@@ -37,7 +37,7 @@ _FORMATS: Final = ("csv", "parquet")
 
 
 @dataclass(frozen=True)
-class Diary:
+class TrainingRecords:
     """What to write down of a training.
 
     Attributes:
@@ -61,7 +61,7 @@ class Diary:
             imported("pyarrow", "parquet")
 
     @classmethod
-    def of(cls, facts: Any) -> Diary | None:
+    def of(cls, facts: Any) -> TrainingRecords | None:
         """That of a training that is resumed, from its facts; None if it had none.
 
         Raises:
