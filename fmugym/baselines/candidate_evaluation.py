@@ -1,4 +1,4 @@
-"""Many controllers play the same episodes, side by side in one vector environment."""
+"""Evaluation of candidates: many controllers play the same episodes in one vector environment."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
 
 Merit = tuple[float, float]
-"""How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
+"""Merit of a candidate: minus the excess of its costs, and its mean return. More is better."""
 
 
 def most_steps_of(env: FMUEnv) -> int | None:
@@ -45,11 +45,11 @@ def most_steps_of(env: FMUEnv) -> int | None:
 
 
 class CeilingError(FMUGymError):
-    """An evaluator may not take more steps."""
+    """The evaluation may not take more steps."""
 
 
 class CandidateScores(NamedTuple):
-    """What n candidates have reached in k episodes.
+    """Returns and costs of n candidates in k episodes.
 
     Attributes:
         returns: The total rewards, shape (n, k).
@@ -67,7 +67,7 @@ class CandidateScores(NamedTuple):
 
     @property
     def merits(self) -> list[Merit]:
-        """The merit of each candidate: those within the limits of all costs come first.
+        """Merit of each candidate; candidates within all cost limits come first.
 
         A fault is an excess, too, as its episode has less to pay for. NaN is an infinite one.
         """

@@ -1,4 +1,4 @@
-"""Who takes part in a search: controllers with numbers to be found, and classes of policies."""
+"""Search of one class of candidates: numbers of a controller, or weights of a network."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if few rounds counted."""
 
 @dataclass
 class CandidateSearch:
-    """One search, and what has come of it.
+    """A search for the numbers of one class of candidates, and its best results.
 
     Attributes:
         cma: The search, a ``CMA``; None for a controller whose numbers are known.
@@ -84,7 +84,7 @@ class CandidateSearch:
         return reached
 
     def _note_agreement(self, returns: FloatArray) -> None:
-        """Take twice as many episodes where chance decides on the order of candidates.
+        """Double the number of episodes if chance decides on the order of candidates.
 
         That is so if the ranks by two halves of the episodes hardly correlate, in the mean of some
         rounds.

@@ -1,4 +1,4 @@
-"""What all controllers share: how they are bound to environments, and the shapes of actions."""
+"""Base class of controllers: binding to environments, and shapes of actions."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class Controller(KnownArguments, ABC):
         return actions if self._is_vector else actions[0]
 
     def reset(self, mask: npt.NDArray[np.bool_] | None = None) -> None:
-        """Begin new episodes; call it where ``terminated`` or ``truncated`` was true.
+        """Begin new episodes in environments whose ``terminated`` or ``truncated`` was true.
 
         Args:
             mask: Which environments begin one, shape (N,); by default all.
@@ -135,7 +135,7 @@ class Controller(KnownArguments, ABC):
     # What a controller adds.
 
     def _prepare(self) -> None:
-        """Find what the controller needs in the space and the names."""
+        """Find the needed elements of the space and of the names."""
 
     @abstractmethod
     def _decide(self, rows: FloatArray) -> FloatArray:
@@ -145,7 +145,7 @@ class Controller(KnownArguments, ABC):
         """Forget the episodes of some environments."""
 
     def add(self, added: FloatArray) -> None:
-        """Tell the controller what is added to its last decision, once that is limited.
+        """Tell the controller a correction that was added to its last decision, after the limits.
 
         An integral does not grow while the sum is at a limit.
 
@@ -179,7 +179,7 @@ class Controller(KnownArguments, ABC):
         )
 
     def _names_of(self, env: Any) -> tuple[str, ...]:
-        """The names of what the environment lets observe."""
+        """Names of the elements of the environment's observation."""
         names: tuple[str, ...] | None = attribute_of(env, "observation_names")
         if names is None:
             raise ConfigError(
@@ -296,7 +296,7 @@ class Controller(KnownArguments, ABC):
 
 
 def limited(values: Any, low: Any, high: Any) -> Any:
-    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers.
+    """Limit values as ``numpy.clip`` does, in less time for up to some hundred numbers.
 
     Formulas are limited alike.
     """
@@ -304,14 +304,14 @@ def limited(values: Any, low: Any, high: Any) -> Any:
 
 
 def either(condition: Any, first: Any, second: Any) -> Any:
-    """Do what ``numpy.where`` does, of formulas, too."""
+    """Choose between values as ``numpy.where`` does, of formulas, too."""
     if isinstance(condition, Value):
         return where(condition, first, second)
     return np.where(condition, first, second)
 
 
 def checked_numbers(what: str, value: Any, **limits: Any) -> NumberOrArray:
-    """Return a number as a float, or those of a one-dimensional array as floats.
+    """Return a number as a float, or a one-dimensional array of floats.
 
     Args:
         what: Its name, for the error.

@@ -1,4 +1,4 @@
-"""Controllers that look at the observation."""
+"""Feedback controllers, which read the observation."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class PID(Law):
         return rest if growth is None else rest + state[0] + growth
 
     def _parts(self, seen: Sequence[Any], state: Sequence[Any]) -> tuple[Any, Any, Any]:
-        """The measured value, the action without the integral, and by what the integral grows."""
+        """Measured value, action without the integral, and growth of the integral."""
         last, value = state[1], self._value(seen, self.of)
         error = self._value(seen, self.setpoint) - value
         change = either(last != last, 0.0, value - last)  # it is NaN in the first step

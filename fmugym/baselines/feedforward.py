@@ -1,4 +1,4 @@
-"""Controllers that do not look at the observation."""
+"""Feedforward controllers, which do not read the observation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Controllers whose decision follows from formulas, which are played and exported alike."""
+"""Control laws: controllers given by formulas, which are played and exported alike."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from fmugym.pool.base import FloatArray
 __all__ = ["Decided", "Law"]
 
 Decided = tuple[Sequence[Any], tuple[Any, ...]]
-"""The elements of an action before they are limited, and what a controller remembers then."""
+"""Elements of an action before the limits, and the new memory of a controller."""
 
 
 class Law(Controller):
-    """A controller whose next action follows from what it sees and a few numbers.
+    """Controller given by formulas of the observation and a few remembered numbers.
 
     Attributes:
         starts: The numbers that it remembers, at the beginning of an episode.
@@ -55,7 +55,7 @@ class Law(Controller):
         return self.law(seen, state)[0][0]
 
     def measured(self) -> list[str]:
-        """What it measures, and its set point: names and other expressions."""
+        """Measured value and set point: names and other expressions."""
         given = (getattr(self, name) for name in self.signals)
         return [one for one in given if isinstance(one, str)]
 

@@ -1,4 +1,4 @@
-"""Model predictive control: the next action of the best plan that copies of the FMU have found."""
+"""Model predictive control: the first action of the best plan on copies of the FMU."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ _DECADES: Final = 1.5
 """Over so many powers of ten the heights of pulses are spread."""
 
 _PENALTY: Final = 1e9
-"""How much more a unit of a cost beyond its limit counts than one of the reward."""
+"""Weight of a unit of a cost beyond its limit, relative to a unit of the reward."""
 
 _FAILURE: Final = 1e100
-"""How much each step counts that a plan lacks because a copy has failed."""
+"""Penalty of each step that a plan lacks because a copy has failed."""
 
 _SURROGATE: Final = "surrogate"
 """The name of a model that is fitted to the FMU."""
@@ -203,7 +203,7 @@ class MPC(Controller):
         return self._surrogate[1]
 
     def _model_of(self) -> Callable[[], Any]:
-        """What makes copies."""
+        """Maker of the copies of the model."""
         if callable(self.model):
             return self.model
         env: FMUEnv = attribute_of(self._env, "unwrapped")
@@ -330,7 +330,7 @@ class MPC(Controller):
         return np.asarray(self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1))
 
     def _follow(self, episode: _Episode, action: Any, row: FloatArray, now: float) -> None:
-        """Let the copies do the step that the environment has done, with what was observed."""
+        """Step the copies as the environment was stepped, and correct them by the observation."""
         if episode.have_ended:
             return
         copied = self._copies
@@ -353,7 +353,7 @@ class MPC(Controller):
         episode.observer.follow(off, sources)
 
     def _find_slopes(self, snapshot: Snapshot) -> FloatArray:
-        """How present values of the observation follow the outputs, shape (k, o)."""
+        """Slopes of present observed values by the outputs, shape (k, o)."""
         copied = self._copies
         action = self._actions(np.full((1, *self._plan_shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
@@ -368,7 +368,7 @@ class MPC(Controller):
     def _start_of(
         self, index: int, episode: _Episode, row: FloatArray, now: float
     ) -> tuple[Snapshot, dict[str, Any], dict[str, Any]]:
-        """Where candidates begin, the data that they assume, and more arguments of rollouts."""
+        """States from which candidates begin, the data that they assume, and arguments."""
         if self.perfect:
             return self._env.save_state(*([[index]] if self._is_vector else [])), {}, {}
         if self.states:
@@ -460,7 +460,7 @@ class MPC(Controller):
         return _Plan(float(values[place]), plans[place], costs)
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
-        """What costs may add up to until the horizon, from what the episode has left of them."""
+        """Limits of costs until the horizon, from the rest that the episode has left."""
         steps, limit = self._plan_shape[0], self._prototype.inside.step_limit
         left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
@@ -471,7 +471,7 @@ class MPC(Controller):
     def _first_plans(
         self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
     ) -> FloatArray:
-        """The plan of the step before, and those of the simple controllers."""
+        """Plan of the step before, and plans of the simple controllers."""
         shifted = np.append(episode.plan[1:], episode.plan[-1:], axis=0)
         if not episode.warm:
             return shifted[np.newaxis]
@@ -508,7 +508,7 @@ class _Plan(NamedTuple):
 
 
 class _Episode:
-    """What is known of the episode of one environment.
+    """Knowledge about the episode of one environment.
 
     Attributes:
         snapshot: Where the copies are.
@@ -542,7 +542,7 @@ class _Episode:
 
 
 class _Foresight:
-    """Tells from observations what data will be.
+    """Forecasts of data, made of observations.
 
     Args:
         names: Those of the observation's elements.
@@ -573,7 +573,7 @@ class _Foresight:
                 self._known[of].sort()
 
     def note(self, told: dict[str, dict[int, float]], row: FloatArray, step: int) -> None:
-        """Keep what is observed and forecast.
+        """Keep observed and forecast data.
 
         Args:
             told: The latest value of each step by name.

@@ -1,4 +1,4 @@
-"""How copies of an FMU follow a plant: which one fits best, and how far its outputs are off."""
+"""Observer of a plant: copies of an FMU that follow it, weighted by their errors."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _LASTING: Final = 0.98
 """The part of the past errors of a copy that counts after a step."""
 
 _SAMPLES: Final = 1001
-"""The copies have quantiles of so many samples of what is drawn."""
+"""Number of samples of which the copies take quantiles."""
 
 
 class Observer:
-    """What is known of copies that run beside a plant.
+    """Estimates of copies that run beside a plant.
 
     Args:
         count: The number n of copies.
@@ -47,7 +47,7 @@ class Observer:
         self._correction = correction
 
     def follow(self, off: FloatArray, sources: Any = slice(None)) -> None:
-        """Count what was measured beyond the copies.
+        """Add measured values to the estimates of the copies.
 
         Args:
             off: The differences, 0 where nothing was measured, shape (n, k).
@@ -67,7 +67,7 @@ class Observer:
 
     @property
     def best(self) -> int:
-        """The copy that fits best; each measured value counts by what copies differ in it."""
+        """Copy that fits best; measured values are weighted by the spread of the copies."""
         totals = self.errors.sum(axis=0)
         parts = self.errors / np.where(totals > 0.0, totals, 1.0)
         return int(parts.sum(axis=1).argmin())

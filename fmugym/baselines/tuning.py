@@ -27,7 +27,7 @@ _SIGMA: Final = 0.2
 
 @dataclass(frozen=True)
 class Tuning:
-    """What a search has found.
+    """Result of a search for the numbers of a controller.
 
     Attributes:
         controller: The best controller, to be bound.

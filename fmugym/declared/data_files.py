@@ -68,7 +68,7 @@ def _column_of_arrow(file: str, name: str, column: Any) -> DataColumn:
 
 @lru_cache(maxsize=16)
 def _read_text(path: Path, changed: int, size: int) -> Mapping[str, DataTable]:
-    """Read a file. Its first line tells what it is."""
+    """Read a file of text, whose first line tells its format."""
     content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     if content.startswith((b"#1", b"LOCATION,")):  # names of places have any encoding
         lines = [line.decode("latin-1") for line in content.splitlines()]

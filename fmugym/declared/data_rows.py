@@ -1,4 +1,4 @@
-"""Rows of data: times on the clock of a task and values, with what is missing."""
+"""Rows of data: times on the clock of a task, and values, some of which may be missing."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class DataRows:
 
     @property
     def has_calendar(self) -> bool:
-        """Whether its times are dates, or those of weather, rather than any seconds."""
+        """Whether the times are dates or hours of weather, rather than any seconds."""
         return self.dates is not None or (self.time is not None and self.time.of_year)
 
     @cached_property
@@ -224,7 +224,7 @@ def _placing(entry: Entry, of_file: str, of_list: str) -> Iterator[None]:
 
 
 def _dates(entry: Entry, time: DataColumn) -> Dates | None:
-    """The times as dates, those without offset of the zone that is declared; None for seconds."""
+    """Read times as dates; None for seconds. Dates without an offset are in the declared zone."""
     zone = entry.value.get("timezone")
     if not time.is_numeric:
         return time.dates_in(zone)

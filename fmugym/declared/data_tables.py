@@ -24,7 +24,7 @@ Cells = Sequence[Any] | npt.NDArray[Any]
 
 _NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
 _INDEX: Final = ("", "__index_level_0__")
-"""How files of pandas call an index without a name, in CSV and in Parquet."""
+"""Names that pandas writes for an index without a name, in CSV and in Parquet."""
 
 _BLANKS: Final = " \t\r\n"
 
@@ -52,7 +52,7 @@ class DataColumn:
     of_year: bool = False
 
     def told(self, index: int) -> str:
-        """Say where a cell stands."""
+        """Describe the place of a cell."""
         file = f"{self.table}, " if self.table else ""
         return f"{file}row {self.rows[index]}, column {shown(self.name)}"
 
@@ -82,7 +82,7 @@ class DataColumn:
 
     @cached_property
     def numbers(self) -> FloatArray:
-        """Its numbers, shape (n,); NaN where a cell is empty.
+        """Numbers of the cells, shape (n,); NaN for an empty cell.
 
         Raises:
             ConfigError: If a cell is no number.
@@ -142,7 +142,7 @@ class DataColumn:
         return Dates.of_instants(moments, zone_of("the time zone of the file", self.zone))
 
     def dates_in(self, zone: datetime.tzinfo | None) -> Dates:
-        """Its dates, those without an offset from UTC as a zone has them.
+        """Dates of the cells; a date without an offset from UTC is on the clock of a zone.
 
         Raises:
             ConfigError: As ``dates``; or if a date does not tell its offset there, or without a

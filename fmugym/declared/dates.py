@@ -60,7 +60,7 @@ _MONTHS_OF_SPRING: Final = (3, 4, 9, 10, 11)
 """When clocks are set forward, in the north and in the south."""
 
 Told = Callable[[int], str]
-"""Says where the row with an index stands."""
+"""Describes the place of a row by its index."""
 
 LOCAL_TIME_ADVICE: Final = (
     "If these are local times with daylight saving time, say of which zone: "
@@ -191,7 +191,7 @@ class Dates:
         return cls(instants + own * _SECOND, own)
 
     def localized(self, zone: datetime.tzinfo, told: Told) -> Dates:
-        """Return dates without offsets with those of a zone.
+        """Give a zone's offsets to dates without an offset.
 
         Rows of an hour that the clock shows twice are told apart by their order.
 
@@ -215,7 +215,7 @@ class Dates:
         return Dates(self.walls, own)
 
     def _switch(self, rows: IntArray, zone: datetime.tzinfo, told: Told) -> int:
-        """How many rows of an hour that comes twice are those of its first time."""
+        """Number of rows in the first pass of an hour that comes twice."""
         falls = np.flatnonzero(np.diff(self.walls[rows]) <= 0)
         if len(falls) == 1:
             return int(falls[0]) + 1
@@ -264,7 +264,7 @@ class Dates:
 
 
 def _walls(dates: Sequence[datetime.datetime]) -> IntArray:
-    """What a clock on the wall shows; numpy itself takes five times as long for many."""
+    """Local times without their offsets; numpy takes five times as long for many."""
     days = np.fromiter(map(datetime.datetime.toordinal, dates), np.int64, len(dates))
     walls = (days - datetime.date(1970, 1, 1).toordinal()) * _DAY
     lengths = {"hour": _HOUR, "minute": 60 * _SECOND, "second": _SECOND, "microsecond": 1}

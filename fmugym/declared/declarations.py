@@ -54,7 +54,7 @@ def is_reserved(name: str) -> bool:
 
 
 class Declarations:
-    """What a task declares.
+    """Sections of a task, read and checked.
 
     Attributes:
         root: The table of all keys.
@@ -83,7 +83,7 @@ class Declarations:
     def __init__(
         self, root: Entry, description: ModelDescription, is_physical: bool = False
     ) -> None:
-        """Read all sections, and note their mistakes, and what does not fit the FMU."""
+        """Read all sections, and note mistakes and values that do not fit the FMU."""
         root, self.name_of = as_declared(root, description)
         self.root, self.is_physical = root, is_physical
         self.variables = TaskVariables(root, description)
@@ -117,11 +117,11 @@ class Declarations:
 
     @property
     def own_names(self) -> list[str]:
-        """The names that are not those of variables, also those that have mistakes."""
+        """Names that belong to no variable, also if their entries have mistakes."""
         return [*self.memory, *self.derived, *self.series, *self.steps, *self._declared]
 
     def is_own(self, name: str) -> bool:
-        """Whether it is one of ``own_names``, of which there may be thousands."""
+        """Whether a name is in ``own_names``, which may have thousands."""
         return any(
             name in known
             for known in (self.memory, self.derived, self.series, self.steps, self._declared)
@@ -147,14 +147,14 @@ class Declarations:
         return found
 
     def _find(self, entry: Entry, role: str) -> TaskVariable | None:
-        """The variable of a name; None for a name that is not that of a variable."""
+        """Find the variable of a name; None for other names."""
         if self.is_own(entry.value):
             return None
         return self.variables.find(entry, entry.value, role, self.own_names)
 
     @property
     def measured(self) -> list[str]:
-        """The names of what the agent observes, and of what it observes the deviation."""
+        """Names that the agent observes, or whose deviation it observes."""
         names = [name for _, name in self.observed] + self.remembered
         return names + [self.deviations[name].of for name in names if name in self.deviations]
 
@@ -217,7 +217,7 @@ class Declarations:
 
     @property
     def normalization(self) -> str | None:
-        """What observations are normalized by: ``"limits"``, ``"nominal"``; None for nothing."""
+        """Divisor of observations: ``"limits"`` or ``"nominal"``; None for no normalization."""
         kind = self.agent("normalize").value
         if self.is_physical or not kind:
             return None
@@ -276,7 +276,7 @@ class Declarations:
                 del self.deviations[name]
 
     def _controlled(self) -> list[tuple[str, str]]:
-        """What is measured and its set point, in pairs, as far as the task tells.
+        """Pairs of a measured value and its set point, as far as the task tells them.
 
         Without set points ``of`` something, the only one is that of the only observed variable.
         """
@@ -303,7 +303,7 @@ class Declarations:
     def _with_fitted(
         self, parameters: dict[str, tuple[TaskVariable, Any]]
     ) -> dict[str, tuple[TaskVariable, Any]]:
-        """Parameters, and after them what a fit has found, which takes their place."""
+        """Parameters of the task, with the fitted ones in place of those of the same name."""
         entry = self.root.child("fitted")
         if entry.value is None:
             return parameters

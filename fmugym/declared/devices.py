@@ -1,4 +1,4 @@
-"""Sensors and actuators: how what they give differs from what it should be."""
+"""Sensors and actuators: delay, bias, noise, limits, and lost samples."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Device:
 
     @property
     def remembers(self) -> bool:
-        """Whether what it gives depends on what it gave before."""
+        """Whether the present value depends on the value before."""
         return self.rate < math.inf or self.drop_out > 0
 
     def distorted(self, value: Value, count: Value, channel: int) -> Value:
@@ -120,7 +120,7 @@ def chance_in(count: Value, channel: int) -> Value:
 
 
 def first_step(graph: Graph) -> Value:
-    """The number 0 in each step: what is random and follows from it lasts for an episode."""
+    """Number 0 in each step, for random values that last for an episode."""
     return Value.read(graph, "step_count") * 0
 
 

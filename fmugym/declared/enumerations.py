@@ -1,4 +1,4 @@
-"""Enumerations that a task writes: each value that is known must be one of the items."""
+"""Checks of Enumerations: each value that a task writes must be one of the items."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def check_controller(entry: Entry, variable: TaskVariable, controller: Controlle
 def check_written(
     entry: Entry, variable: TaskVariable, value: Value, memory: Mapping[str, MemoryVariable]
 ) -> None:
-    """Check what an expression writes to an Enumeration, as far as that is known.
+    """Check the known values of an expression that is written to an Enumeration.
 
     Args:
         entry: Where the expression stands.
@@ -80,7 +80,7 @@ def _require_items(entry: Entry, variable: Variable, values: Iterable[float]) ->
 
 
 def _known(value: Value, memory: Mapping[str, MemoryVariable]) -> Iterator[float]:
-    """What a value is at one time or another, as far as that is known."""
+    """Values that are known to occur at one time or another."""
     graph, waiting = value.graph, [value.node]
     while waiting:
         node = graph.nodes[waiting.pop()]

@@ -1,4 +1,4 @@
-"""What a fit to logs of a plant has found, of which an episode draws a row."""
+"""Results of a fit to logs of a plant: rows of parameters, one of which an episode draws."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ from fmugym.systems.wired import SYSTEM
 __all__ = ["AGENT", "DEVICE", "KPI", "PLANT", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
 
 SCHEMA: Final = Path(__file__).parent / "task.schema.json"
-"""What the keys are, for editors; ``docs/_site/keys.py`` writes it."""
+"""JSON Schema of the keys, for editors; ``docs/_site/keys.py`` writes it."""
 
 VERSION: Final = 1
 """The version of the format; it is raised when a key changes its meaning."""
@@ -68,7 +68,7 @@ _NORMALIZATIONS: Final = ("limits", "nominal")
 
 
 def _within(read: Callable[[str, Any], float], **limits: Any) -> Callable[[str, Any], float]:
-    """A check of what another one reads, as in ``check_number``."""
+    """Make a check of limits for the result of another check, as in ``check_number``."""
     return lambda what, value: check_number(what, read(what, value), **limits)
 
 
@@ -284,7 +284,7 @@ def _evaluated(check: Callable[[str, Any], Any], what: str, value: Any) -> Any:
 
 
 def _taking_expressions(kind: Any) -> Any:
-    """The same kind, or a table of such, where expressions of constants stand for numbers, too."""
+    """Let a kind, or all kinds of a table, take expressions of constants for numbers."""
     match kind:
         case Kind() if kind.schema.get("type") in ("number", "integer"):
             schema = {**kind.schema, "type": [kind.schema["type"], "string"]}
@@ -901,7 +901,7 @@ _OF_SECTIONS: Final = {
         "it stands above [config]",
     ),
 }
-"""Keys of a config that other sections of a task determine, and how."""
+"""Keys of a config that other sections of a task determine, with the section to use."""
 
 CONFIG_OF_TASK: Final = _taking_expressions(
     Table(

@@ -1,4 +1,4 @@
-"""The mistakes of a task, which are found in one go."""
+"""Mistakes of a task, which are collected and reported together."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MOST: Final = 100
 
 
 class Mistakes:
-    """What is wrong with a task, by the keys of the values that are wrong.
+    """Mistakes of a task, by the keys of the wrong values.
 
     What only follows from a mistake is none: whatever needs a value that could not be read raises
     ``ConsequenceError``, which is not noted.

@@ -1,4 +1,4 @@
-"""From a declared task and a model description to a config, spaces and hooks."""
+"""Resolution of a task: its declarations and a model description make a config and hooks."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ _Hook = Callable[..., Any]
 
 
 class ResolvedTask:
-    """What an environment needs to know of its task.
+    """Config, spaces and hooks of an environment, made of a declared task.
 
     Args:
         task: The task.
@@ -119,7 +119,7 @@ class ResolvedTask:
         root.mistakes.require_none()
 
     def _make(self) -> None:
-        """Make what the attributes are."""
+        """Make the values of the attributes."""
         declared = self._declared
         self.config = self._make_config()
         self.formulas = self._make_formulas()
@@ -134,7 +134,7 @@ class ResolvedTask:
 
     @property
     def future(self) -> Future:
-        """What hooks read of the future."""
+        """Data and random numbers of later times, for hooks."""
         data = self._root.child("data").value or {}
         lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
         keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
@@ -155,7 +155,7 @@ class ResolvedTask:
         return Quantities([quantity for quantity, _ in found.values()], read)
 
     def _makers(self) -> Iterator[tuple[Entry, Callable[[], Any]]]:
-        """What evaluates everything once, so that one error tells all mistakes."""
+        """Functions that evaluate everything once, so that one error tells all mistakes."""
         declared = self._declared
         for entry, expression, moment in self._plain_expressions():
             yield entry, partial(self._naming.value, entry, expression, moment)
@@ -175,7 +175,7 @@ class ResolvedTask:
             yield seen.entry, partial(self._in_form, seen)
 
     def _plain_expressions(self) -> Iterator[tuple[Entry, Expression, Moment]]:
-        """Expressions that are used as they are, where they stand, and when they are evaluated."""
+        """Expressions without a form of their own, their places, and the moments of evaluation."""
         for memory in self._declared.memory.values():
             if memory.update is not None:
                 yield memory.entry, memory.update, Moment.AFTER
@@ -226,7 +226,7 @@ class ResolvedTask:
         }
 
     def _variables(self) -> dict[str, Any]:
-        """All episode variables, and what they are at the beginning of an episode."""
+        """All episode variables with their start values."""
         memory = {name: one.start for name, one in self._declared.memory.items()}
         kept = {one.variable: np.zeros(one.length) for one in (*self._kept, *self._sensors)}
         switches: dict[str, float] = {}
@@ -283,7 +283,7 @@ class ResolvedTask:
         return hooks
 
     def _action_space(self) -> spaces.Space[Any] | None:
-        """The action space; None if it is that of the inputs as they are."""
+        """Action space; None for the space of the inputs."""
         variables = self._declared.actions
         are_inputs = all(
             variable.in_fmu is not None and has_fmu_values(variable) for variable in variables
@@ -339,7 +339,7 @@ class ResolvedTask:
         return lambda env: np.array(masks(env), dtype=np.bool_)
 
     def _observation_space(self) -> spaces.Space[Any] | None:
-        """The observation space; None if it is that of the outputs as they are."""
+        """Observation space; None for the space of the outputs."""
         names, variables = [seen.name for seen in self._seen], self._declared.variables
         if (
             self._declared.normalization is None
@@ -351,7 +351,7 @@ class ResolvedTask:
 
     @cached_property
     def _normalized(self) -> list[Seen]:
-        """What the agent observes, in the form of its observations."""
+        """Normalized observed values, in the form of the observations."""
         return [self._in_form(seen) for seen in self._seen]
 
     def _in_form(self, seen: Seen) -> Seen:
@@ -393,11 +393,11 @@ class ResolvedTask:
         return {"_explain": explain, "_fault_reward": self._fault_reward()}
 
     def _updates_of_histories(self) -> list[Update]:
-        """The sensors follow what they measure."""
+        """Updates of histories and sensors; sensors come after the values that they measure."""
         return [remembered(self._naming, kept) for kept in (self._kept, self._sensors)]
 
     def _switched(self) -> dict[str, Value]:
-        """What the task remembers of actions with a least time on or off, by variables."""
+        """Memory of actions with a least time on or off, by variable."""
         values: dict[str, Value] = {}
         for variable in self._switched_actions:
             values |= zip(switch_names(variable), self._naming.switched(variable), strict=True)
@@ -420,7 +420,7 @@ class ResolvedTask:
         }
 
     def _kpi_value(self, kpi: Kpi) -> Value:
-        """What a figure is made of in a step."""
+        """Value that a step adds to a figure."""
         moment = Moment.JUDGED if kpi.how is None else Moment.UPDATED
         names = self._term_values(moment) | (self._known_kpis() if kpi.how is None else {})
         return self._naming.value(kpi.entry, kpi.expression, moment, names).number
@@ -450,7 +450,7 @@ class ResolvedTask:
         return values
 
     def _updated_memory(self) -> dict[str, Value]:
-        """All values of the memory are computed before one of them is written."""
+        """New values of the memory; all are computed before one is written."""
         return {
             name: self._naming.value(memory.entry, memory.update, Moment.AFTER).number
             for name, memory in self._declared.memory.items()

@@ -1,4 +1,4 @@
-"""When in a year an episode begins: dates, seasons and scenarios."""
+"""Beginnings of episodes in the year: dates, seasons and scenarios."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _excluded(entry: Entry, scenarios: Mapping[str, Scenario]) -> list[Scenario]
 
 
 def held_out_times(root: Entry) -> list[Scenario]:
-    """When in a year a task has no episodes but those of its scenarios: in these, and off season.
+    """Times of the year without training episodes: scenarios, and days outside of the season.
 
     Args:
         root: The task outside of its scenarios.

@@ -1,4 +1,4 @@
-"""What the sections of a task consist of, and how it is read."""
+"""Entries of the sections of a task: memory, named expressions, rewards and costs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Term:
 
 @dataclass(frozen=True)
 class MemoryVariable:
-    """A value that the task itself remembers during an episode.
+    """A variable that the task keeps from step to step.
 
     Attributes:
         entry: Where it stands.
@@ -68,7 +68,7 @@ class Derived:
 
 
 def read_memory(entry: Entry) -> MemoryVariable:
-    """Read a value that the task remembers."""
+    """Read an entry of ``[memory]``."""
     start = entry.required("start").value
     return MemoryVariable(entry, start, entry.value.get("update"), read_limits(entry))
 
@@ -85,6 +85,6 @@ def read_term(entry: Entry) -> Term:
 
 
 def read_limits(entry: Entry, low: float = -np.inf, high: float = np.inf) -> Limits:
-    """Read ``min`` and ``max`` of a table, which may be missing, in the place of other limits."""
+    """Read ``min`` and ``max`` of a table; other limits take the place of missing ones."""
     given = entry.value or {}
     return given.get("min", low), given.get("max", high)

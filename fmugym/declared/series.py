@@ -61,7 +61,7 @@ class Series:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Those of its files."""
+        """Spans of time that its files cover."""
         return tuple(Span(one.start, one.period) for one in self.files)
 
     @property

@@ -1,4 +1,4 @@
-"""Set points: what a task wants a variable to be."""
+"""Set points: values to which a task wants to bring variables."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Steps:
 
 
 class Deviation(NamedTuple):
-    """How far something is from its set point.
+    """Deviation of a variable from its set point.
 
     Attributes:
         setpoint: The name of the set point.

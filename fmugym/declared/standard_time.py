@@ -69,7 +69,7 @@ def _data(root: Entry) -> Iterator[Entry]:
 
 
 def _told(data: Iterable[Entry]) -> Iterator[tuple[str, int | None, tuple[int, ...]]]:
-    """What files tell; whoever reads their data says what is wrong with them."""
+    """Offsets that files tell; mistakes are reported by the reader of their data."""
     for entry in data:
         with suppress(ConfigError):
             yield utc_offsets_of(entry)

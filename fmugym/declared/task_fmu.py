@@ -88,7 +88,7 @@ def _fmu_or_archive(entry: Entry, master: str | None) -> Path | FMUSystem:
 
 @contextmanager
 def _placing_load(entry: Entry) -> Iterator[None]:
-    """Let errors of a file say where the task names it."""
+    """Add the place of a file in the task to errors about the file."""
     try:
         yield
     except FMULoadError as error:
@@ -139,7 +139,7 @@ def _system(section: Entry, master: str | None) -> FMUSystem:
 
 
 def _sound_part(section: Entry, options: dict[str, Any]) -> FMUSystem:
-    """Note what is wrong in a system, and make it of the rest."""
+    """Note the mistakes of a system, and make a system of its sound part."""
     sound = {**options, "components": {}, "connections": [], "units": {}}
     for name, component in options["components"].items():
         for given in (replace(component, start_values={}), component):
@@ -166,7 +166,8 @@ def _sound_part(section: Entry, options: dict[str, Any]) -> FMUSystem:
 
 _MOST_KNOWN: Final = 16
 _known: Final[dict[Any, FMUSystem]] = {}
-"""Systems by what declares them and the state of their FMUs: environments of a task share one."""
+"""Systems by their declarations and the state of their FMUs, shared by the environments of a
+task."""
 
 
 def _component(entry: Entry) -> tuple[Component, _State]:
@@ -205,7 +206,7 @@ def _resized(description: ModelDescription, parameters: Entry) -> ModelDescripti
 
 
 _State = tuple[Path, int, int]
-"""A file, and what changes with its content."""
+"""A file, and its time of change and size, which change with the content."""
 
 
 def _state(entry: Entry, path: Path) -> _State:

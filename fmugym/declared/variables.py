@@ -204,7 +204,7 @@ class TaskVariables:
         return variable
 
     def _dotted(self, name: str, value: object) -> str:
-        """Say what TOML makes of a name with dots, if that explains an unknown name."""
+        """Explain that TOML reads a name with dots as tables, if that explains an unknown name."""
         while isinstance(value, Mapping) and value:
             key = next(iter(value))
             name, value = f"{name}.{key}", value[key]
@@ -326,7 +326,7 @@ def _with_unit(alias: str, entry: Entry, description: ModelDescription) -> Varia
 
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> Limits:
-    """The limits of the task, or else those of the FMU."""
+    """Limits of the task, or else of the FMU."""
     own = (-math.inf, math.inf) if variable is None else variable.extremes
     low, high = read_limits(entry, *sorted(map(conversion, own)))
     if entry.value and not low < high and entry.value.keys() & {"min", "max"}:
@@ -341,7 +341,7 @@ def _own_nominal(variable: Variable | None, conversion: Conversion) -> float | N
 
 
 def has_fmu_values(variable: TaskVariable) -> bool:
-    """Whether the values of the task are those of the FMU."""
+    """Whether the task gives the values to the FMU without a change."""
     is_same = variable.conversion == IDENTITY and not variable.levels
     return is_same and variable.is_direct
 

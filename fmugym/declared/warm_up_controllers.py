@@ -1,4 +1,4 @@
-"""Controllers that act on the variables of a task before an episode begins."""
+"""Controllers of a warm-up, which act on the variables of a task before an episode begins."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
 
 
 def _described(graph: Graph, roots: Sequence[int]) -> list[Any]:
-    """What nodes of a graph compute, in a form that is the same in every process."""
+    """Describe nodes of a graph by a text that is the same in every process."""
     order = graph.needed(roots)
     places = {number: place for place, number in enumerate(order)}
     described: list[Any] = [places[root] for root in roots]
@@ -101,7 +101,7 @@ class WarmUpControllers:
         }
 
     def _rows(self, env: Any) -> Any:
-        """What is measured; controllers work with numbers of float32."""
+        """Measured values, rounded to float32 as controllers read them."""
         rows = np.empty((len(env.step_count), len(self._names)))
         for place, signal in enumerate(self._read(env)):
             rows[:, place] = signal

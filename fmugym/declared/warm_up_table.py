@@ -1,4 +1,4 @@
-"""The warm-up of a declared task: controllers that act before an episode begins."""
+"""The key ``warm_up`` of a task: controllers that act before an episode begins."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["WARM_UP_CLOCK", "WarmUpTable", "read_warm_up"]
 
 WARM_UP_CLOCK: Final = "clock"
-"""What schedules of a warm-up read; it is not rounded as measured values are."""
+"""Name of the time that schedules of a warm-up read; it is not rounded as measured values are."""
 
 THERMOSTATS: Final = ("thermostat", "hysteresis")
 """The names of a controller whose arguments the task may tell."""
@@ -28,7 +28,7 @@ THERMOSTATS: Final = ("thermostat", "hysteresis")
 
 @dataclass(frozen=True)
 class WarmUpTable:
-    """What a task says about its warm-up.
+    """Declaration of the warm-up of a task.
 
     Attributes:
         entry: Where it stands.
@@ -49,7 +49,7 @@ class WarmUpTable:
         return [] if self.controllers is None else list(self.controllers.acting)
 
     def measured(self) -> list[str]:
-        """What the controllers measure: names and other expressions."""
+        """Names and expressions that the controllers measure."""
         return [] if self.controllers is None else self.controllers.measured()
 
 
@@ -101,7 +101,7 @@ def read_warm_up(
 
 
 def _table(entries: Mapping[str, Any]) -> ControllerTable:
-    """The table of what acts; its schedules go by the clock."""
+    """Controllers of the warm-up as a table; their schedules go by the clock."""
     from fmugym.baselines import ControllerTable, Schedule
 
     table = ControllerTable(entries)
@@ -235,7 +235,7 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
 
 
 def _require_expressions(controller: Controller) -> None:
-    """Refuse what is no expression in what a controller measures."""
+    """Check that the measured values of a controller are expressions."""
     from fmugym.baselines.law import Law
 
     for signal in controller.measured() if isinstance(controller, Law) else ():

@@ -1,4 +1,4 @@
-"""Weather of EnergyPlus (EPW files), and the tables of Modelica, which may be such weather.
+"""Weather of EnergyPlus (EPW files), and tables of Modelica, which may contain such weather.
 
 Sources: EnergyPlus, Auxiliary Programs, "EnergyPlus Weather File (EPW) Data Dictionary", for the
 fields, their order, their codes for missing values, and what is a mean of the time before;
@@ -70,7 +70,7 @@ _CODES_OF_TABLES: Final = {**_CODES, "Wind Direction": math.inf}
 """The same in tables, which count turns of the wind beyond 360 degrees."""
 
 _MEANS: Final = ("Radiation", "Illuminance", "Luminance")
-"""How the names of fields end that are means of the time since the row before."""
+"""Ends of the names of fields whose values are means since the row before."""
 
 _PLACE_OF_OFFSET: Final = 8
 """The cell of the line of the place with the hours from UTC."""
@@ -109,7 +109,7 @@ def read_weather(name: str, lines: Sequence[str]) -> DataTable:
 
 
 def _fields(name: str, text: str) -> tuple[int, dict[str, DataColumn]]:
-    """How many records there are in an hour, and the fields of those not of 29 February."""
+    """Number of records in an hour, and fields of all records but those of 29 February."""
     head = _PERIODS.search(text)
     above = text.count("\n", 0, head.end()) + 1 if head else 0
     lines = enumerate(text.split("\n")[above:] if head else [], above + 1)

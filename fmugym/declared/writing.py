@@ -55,7 +55,7 @@ def as_toml(document: Mapping[str, Any]) -> str:
 
 
 def _table(items: Mapping[str, Any], keys: _Keys) -> Any:
-    """A table with a heading; those within it that have one come last."""
+    """Write a table with a heading; inner tables with headings come last."""
     import tomlkit
 
     table, last = tomlkit.table(), {}

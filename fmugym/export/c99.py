@@ -168,7 +168,7 @@ class _Source:
         return self._helpers.setdefault((helper, letter), f"{self._name}_{helper}{suffix}")
 
     def _evaluated(self, numbers: Iterable[int]) -> Iterator[str]:
-        """The lines that compute some nodes, and those that they need."""
+        """Write the lines that compute some nodes, with the nodes that these need."""
         needed = set(self._graph.needed(numbers, self._logic.loads))
         for number in sorted(needed - self._texts.keys()):
             node = self._graph.nodes[number]

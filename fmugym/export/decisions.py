@@ -1,4 +1,4 @@
-"""What lies between an observation and an action: a network, and what else an agent computes."""
+"""Decision of an agent: the network and other formulas between observation and action."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _decided_by_any(seen: Sequence[Value], memory: Sequence[Any], ask: _Ask) -> 
 
 @dataclass(frozen=True)
 class Decision:
-    """How an agent decides; by default any action may follow from the observation.
+    """Decision rule of an agent; by default any action may follow from the observation.
 
     Attributes:
         network: Its network; None for none.
@@ -52,7 +52,7 @@ class Decision:
 
 
 def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
-    """Find how an agent decides.
+    """Make the decision rule of an agent.
 
     Args:
         env: The environment.
@@ -108,7 +108,7 @@ def _of_policy(policy: ResidualPolicy) -> Decision:
 
 
 def _network_of(policy: ResidualPolicy) -> tuple[Network | None, _Ask]:
-    """The network, and what its last values mean.
+    """Read the network, and the meaning of its last values.
 
     There is none if nobody corrects the controller, or the network sees nothing and so gives
     constants.

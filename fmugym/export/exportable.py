@@ -1,4 +1,4 @@
-"""An agent with everything around its network, ready to be written in some form."""
+"""Exported agents: agents with all formulas around their networks, ready to be written."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TAKEN: Final = frozenset(
     | {f"fmi{n}{part}" for n in (2, 3) for part in ("Functions", "FunctionTypes", "TypesPlatform")}
     | {"fmi3PlatformTypes"}
 )
-"""The headers and sources that stand beside those of an agent."""
+"""Headers and sources beside those of an agent, whose names are taken."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def agent_of(
 
 
 def check_name(name: str) -> str:
-    """Check what functions and files are called by, and return it.
+    """Check and return the name of functions and files.
 
     Raises:
         ConfigError: If it has more than letters, digits and _, or is that of another file.

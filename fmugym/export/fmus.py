@@ -96,7 +96,7 @@ def _write_sources(agent: ExportedAgent, fmi_version: str, folder: Path) -> str:
 
 
 def _model(agent: ExportedAgent, ports: Sequence[AgentVariable], token: str) -> str:
-    """What the functions of FMI need to know of the agent."""
+    """Write the constants of an agent that the functions of FMI need."""
     name, logic = agent.name, agent.logic
     starts = [constant(one.start, "d") for one in ports if one.causality == "input"]
     fixed = [

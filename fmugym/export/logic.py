@@ -1,4 +1,4 @@
-"""What surrounds the network of an agent: from measurements to its features, and to inputs.
+"""Logic around the network of an agent: features from measurements, inputs from actions.
 
 It consists of the formulas of the task, and between them of those of the agent. Between two samples
 a controller knows its measurements and what it has kept: earlier measurements, actions and inputs,
@@ -33,7 +33,7 @@ from fmugym.vector.hooks.formula_programs import Translation, written_variables
 __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
 
 Load = tuple[Any, ...]
-"""Where a value comes from: ``("measurement", i)``, ``("kept", field, i)``, ``("count",)``,
+"""Source of a value: ``("measurement", i)``, ``("kept", field, i)``, ``("count",)``,
 ``("active",)``, ``("given", i)`` by the network, or ``("constant", value)``."""
 
 _GIVEN: Final = "given"
@@ -118,7 +118,7 @@ def logic_of(
     all_inputs: bool = False,
     external: Collection[str] = (),
 ) -> Logic:
-    """Find what a task and its agent do between measurements and inputs, but for the network.
+    """Make the logic between measurements and inputs, without the network.
 
     Args:
         env: The environment. It is not stepped. What its sensors and actuators do is left out; see
@@ -164,7 +164,7 @@ _KEYS: Final[Mapping[str, str]] = {
 
 
 def _formulas_of(env: FMUEnv) -> Formulas:
-    """The formulas of a task; those of hooks that no controller needs may be missing.
+    """Formulas of a task; formulas of hooks that no controller needs may be missing.
 
     Raises:
         ConfigError: If a hook is a function of Python.
@@ -222,7 +222,7 @@ class _Sample:
     def _decided(
         self, observation: Sequence[Value]
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
-        """The action, and what the agent remembers then."""
+        """Action of a sample, and the memory of the agent after it."""
         memory = [
             [self._row("before", name, index) for index in range(start.size)]
             for name, start in self._decision.starts.items()
@@ -260,7 +260,7 @@ class _Sample:
 
 
 def _row_of(node: Node) -> Any:
-    """The row that a node loads; that of a variable is the same between two samples."""
+    """Row that a node loads; a variable has the same row between two samples."""
     row: Any = node.what
     return ("before", *row[1:]) if row[0] == "variable" else row
 
@@ -270,7 +270,7 @@ def _nodes(values: Iterable[Value]) -> tuple[int, ...]:
 
 
 class _Assembly:
-    """Makes a ``Logic`` of a sample: only what the actions depend on is kept."""
+    """Makes a ``Logic`` of a sample, and keeps only the nodes on which the actions depend."""
 
     def __init__(
         self,
@@ -326,7 +326,7 @@ class _Assembly:
         )
 
     def _reads(self, needed: Iterable[int]) -> defaultdict[str, list[Any]]:
-        """What some nodes read, by kind: the rest of rows, and elements of actions."""
+        """Rows and elements of actions that some nodes read, by kind."""
         found = defaultdict(list)
         for number in sorted(needed):
             node = self._graph.nodes[number]
@@ -335,7 +335,7 @@ class _Assembly:
         return found
 
     def _next_values(self, needed: Iterable[int]) -> Iterator[int]:
-        """The nodes of what is kept for the next sample."""
+        """Nodes of the values that are kept for the next sample."""
         reads = self._reads(needed)
         for name, *_ in reads["before"]:
             yield from self._sample.updates.get(name, ())
@@ -423,7 +423,7 @@ class _Assembly:
     # Where values come from.
 
     def _load(self, number: int, places: list[int]) -> Load | None:
-        """Where a node's value comes from; None if it is computed, or a constant."""
+        """Source of a node's value; None for a computed value or a constant."""
         node = self._graph.nodes[number]
         what: Any = node.what
         if number in self._external:

@@ -140,7 +140,7 @@ def _add_units(root: Any, ports: Sequence[AgentVariable], units: Mapping[str, Un
 
 
 class _Writer:
-    """What both FMI versions have."""
+    """Writer of the parts of a model description that both FMI versions share."""
 
     version: str
     number: str

@@ -1,4 +1,4 @@
-"""Networks as data: layers of weights, what leads into them, and how they choose an action."""
+"""Networks as data: layers of weights, features, and the choice of an action."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ ACTIVATIONS: Final[dict[str, Callable[..., Any]]] = {
     "softplus": _softplus,
     "clamp": lambda x, low, high: np.clip(x, low, high),
 }
-"""The functions by name; their constants are those of PyTorch's modules."""
+"""Activation functions by name, with the constants of PyTorch's modules."""
 
 _MODULES: Final[dict[str, Callable[[Any], Activation]]] = {
     "Tanh": lambda m: Activation("tanh"),
@@ -135,12 +135,12 @@ class Network:
 
     @property
     def width(self) -> int:
-        """How many values it takes."""
+        """Number of inputs of the network."""
         return int(self.layers[0].weights.shape[1])
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """How many of the last values decide on each element of the action."""
+        """Numbers of last values that decide on each element of the action."""
         space: Any = self.space
         if isinstance(space, spaces.Discrete):
             return (int(space.n),)
@@ -170,7 +170,7 @@ class Network:
         return replace(self, layers=(*self.layers, Layer(np.diag(half), middle)), space=space)
 
     def scaled(self, observation: Sequence[Any]) -> Sequence[Any]:
-        """What the first layer takes, in its type then, of numbers or formulas."""
+        """Scale numbers or formulas to inputs of the first layer, in its type."""
         return observation if self.scaling is None else self.scaling(observation)
 
     def values(self, observation: _Array) -> _Array:
@@ -208,7 +208,7 @@ class Network:
 
 
 def _place_of_largest(values: Sequence[Any]) -> Any:
-    """The place of the largest value, the first one of several."""
+    """Index of the largest value; of equal ones, the first."""
     place, largest = 0, values[0]
     for index, one in enumerate(values[1:], 1):
         is_larger = one > largest

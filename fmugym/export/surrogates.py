@@ -1,4 +1,4 @@
-"""Surrogates as what can be written: from inputs, and what they keep, to outputs."""
+"""Surrogates as exported agents, from inputs and kept values to outputs."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class _Writer:
         self._kept: list[Kept] = []
 
     def logic(self) -> Logic:
-        """From inputs, and what is kept, to outputs."""
+        """Make the logic from inputs and kept values to outputs."""
         surrogate, spec = self._surrogate, self._surrogate.spec
         outputs, lags = len(spec.outputs), surrogate.terms.form.lags
         given = [self._loaded("measurement", place) for place in range(len(spec.inputs))]
@@ -80,7 +80,7 @@ class _Writer:
         )
 
     def _inputs(self, given: Sequence[Value]) -> tuple[list[Value], list[Value]]:
-        """The part of a row, and what is kept of it: inputs, and their changes."""
+        """Part of a row for inputs and their changes, and the values that are kept for it."""
         lags = self._surrogate.terms.form.lags
         kept = self._keeping("inputs", [0.0] * len(given) * lags)
         count = self._loaded("count", dtype=np.dtype(np.int64))
@@ -91,7 +91,7 @@ class _Writer:
         return row, row[: len(kept)]
 
     def _constants(self) -> list[Value]:
-        """The outputs at the start of all episodes, where nothing is set before."""
+        """Outputs at the start of all episodes, if no start values are set."""
         return [Value.of(self._graph, float(one)) for one in self._surrogate.start.weights[:, 0]]
 
     def _loaded(self, *load: Any, dtype: np.dtype[Any] = _DOUBLE) -> Value:

@@ -1,4 +1,4 @@
-"""What a task computes around the steps of its FMU, as values of one graph."""
+"""Formulas of a task around the steps of its FMU: updates, rewards and ends in one graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the graph of what hooks compute to instructions for the native pool."""
+"""Compiler from the graph of a task to instructions of the native pool."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 __all__ = ["BackgroundLoop"]
 
 _JOIN_SECONDS: Final = 0.1
-"""How long to wait for the effect of a cancellation, in seconds."""
+"""Time to wait for the effect of a cancellation, in seconds."""
 
 
 class BackgroundLoop:

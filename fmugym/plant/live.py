@@ -1,4 +1,4 @@
-"""Data of a task that a plant, or a file that something else refreshes, tells while it runs."""
+"""Live data of a task, which a plant or a refreshed file tells while an episode runs."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Live:
                 )
 
     def refresh(self, now: float, tags: dict[str, tuple[float, ...]]) -> dict[str, str]:
-        """Let environments look up what is known now.
+        """Let environments look up the data that are known now.
 
         Args:
             now: The plant's time, in seconds of the year.
@@ -136,7 +136,7 @@ def _relative(env: Any, names: Iterable[str]) -> Iterator[str]:
 
 
 def horizon(root: Entry, name: str) -> float:
-    """How far ahead the agent sees some data, in seconds."""
+    """Largest forecast horizon of some data, in seconds."""
     return max((float(one["horizon"]) for one in forecasts(root, name)), default=0.0)
 
 

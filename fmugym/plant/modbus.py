@@ -1,4 +1,4 @@
-"""Modbus TCP: a client that only reads, and a server that nobody writes to."""
+"""Modbus TCP: a client that only reads, and a server that cannot be written to."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fmugym.plant.tags import Plant, Tag
 __all__ = ["ModbusClient", "serve_modbus"]
 
 _PORT: Final = 502
-"""That of Modbus TCP, where an address has none."""
+"""Port of Modbus TCP for addresses without one."""
 
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
@@ -32,13 +32,13 @@ _KINDS: Final = {
     "holding": (3, "read_holding_registers"),
     "input": (4, "read_input_registers"),
 }
-"""The functions that read, by what they read: their codes, and the library's names."""
+"""Functions that read coils and registers: their codes, and the library's names."""
 
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
 
 
 class _Place(NamedTuple):
-    """Where a tag is: registers or bits of a device, from the first one to before the end."""
+    """Place of a tag: registers or bits of a device, from the first to before the end."""
 
     unit_id: int
     kind: str
@@ -64,7 +64,7 @@ def _type(tag: Tag) -> Any:
 
 
 def _answer(place: _Place, cells: Sequence[Any]) -> TagReading:
-    """The numbers in registers or bits; devices write NaN for what they do not know."""
+    """Numbers in registers or bits; devices write NaN for unknown values."""
     found: Any = cells
     tag = place.tag
     if not place.is_bits:
@@ -89,7 +89,7 @@ def _cells(place: _Place, values: Sequence[float]) -> Sequence[int]:
 
 
 def _places(plant: Plant) -> list[_Place]:
-    """Those of all tags, in their order."""
+    """Places of all tags, in their order."""
     found = [_Place.of(plant, tag) for tag in plant.tags.values()]
     return sorted(found, key=lambda one: one[:4])
 
@@ -140,7 +140,7 @@ class ModbusClient:
         return found
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
-        """The registers or bits, and what the server says instead."""
+        """Ask for registers or bits; returns them, and the fault that the server tells."""
         ask = getattr(self._client, _KINDS[place.kind][1])
         if not self._client.connected:
             raise ConnectionLostError("the connection is lost")
@@ -196,7 +196,7 @@ async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator
 
 
 class _Registers(NamedTuple):
-    """Where a server finds registers and bits: it makes them of the values of now."""
+    """Registers and bits of a server, made of the present values."""
 
     places: Sequence[_Place]
     values: Values
@@ -204,7 +204,7 @@ class _Registers(NamedTuple):
     # The library gives these methods their names.
 
     async def async_getValues(self, unit_id: int, code: int, begin: int, count: int) -> Any:  # noqa: N802
-        """The cells from some place on; those between tags are 0."""
+        """Cells from an address on; cells between tags are 0."""
         found: dict[int, int] = {}
         now = self.values()
         for one in self.places:
@@ -216,5 +216,5 @@ class _Registers(NamedTuple):
         return [found.get(place, 0) for place in range(begin, begin + count)]
 
     async def async_setValues(self, *_: Any) -> Any:  # noqa: N802
-        """Refuse who writes."""
+        """Refuse to be written."""
         return ExcCodes.ILLEGAL_FUNCTION

@@ -1,4 +1,4 @@
-"""OPC UA: a client that only reads, and a server that nobody writes to."""
+"""OPC UA: a client that only reads, and a server that cannot be written to."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
 async def _only(
     path: str, refusal: Callable[[], Exception]
 ) -> Callable[[Any, Any], Awaitable[None]]:
-    """What takes the certificate in a file, and raises an error at all others."""
+    """Make a validator that accepts only the certificate in a file."""
     known = await _certificate_in(Path(path))
 
     async def validate(certificate: Any, description: Any) -> None:
@@ -132,7 +132,7 @@ async def _only(
 
 
 def _content(path: Path) -> Any:
-    """What a file has, read at once: the library leaves files open when a poller is stopped."""
+    """Content of a file, read at once: the library leaves files open when a poller is stopped."""
     require_regular(path)
     return CertProperties(path.read_bytes(), path.suffix.removeprefix("."))
 

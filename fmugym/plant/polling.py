@@ -1,4 +1,4 @@
-"""What a client of a protocol offers, and the thread that asks it again and again."""
+"""Poller of tags: the interface of clients, and the thread that asks them periodically."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CertificateError(ConnectionLostError):
 
 
 class TagReading(NamedTuple):
-    """What a server says of a tag.
+    """Answer of a server about a tag.
 
     Attributes:
         numbers: In the unit of the task.
@@ -72,7 +72,7 @@ class Round(NamedTuple):
 
 
 class TagClient(Protocol):
-    """Reads from a server. It has no method that writes."""
+    """Interface of a client, which reads from a server and has no method that writes."""
 
     def connected(self) -> AbstractAsyncContextManager[None]:
         """Connect, and disconnect in the end, whatever has happened before.
@@ -169,7 +169,7 @@ class Poller:
         return found
 
     def trouble(self, name: str) -> str:
-        """What is wrong with a tag now; "" if nothing is."""
+        """Present fault of a tag; "" for none."""
         return self._trouble or (self.answers[name].fault if self.answers else "")
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""What a copy of the FMU foretells of a plant, and how wrong that is."""
+"""Predictions of a plant by copies of its FMU, and their errors."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Predictions:
         return np.array([self._feed.values[name][0] for name in self.names])
 
     def _seen(self) -> FloatArray:
-        """What the copies give, shape (n, k)."""
+        """Outputs of the copies, shape (n, k)."""
         return np.array([[tag.of_fmu(env.out) for tag in self._tags] for env in self.envs])
 
     def begin(self) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""An FMU as a plant: what a server of the loopback tells of it."""
+"""Server of a simulated plant: an FMU whose values are the tags of a server on the loopback."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class _Twin:
         self._advance()
 
     def _places_of_sensors(self) -> dict[str, int]:
-        """Where in the observation is what sensors show, by name."""
+        """Places of sensor readings in the observation, by name."""
         names = self.env.observation_names or ()
         if "normalize" in self.env.unphysical_keys:
             return {}
@@ -109,17 +109,17 @@ class _Twin:
         self._steps += 1
 
     def summary(self) -> Summary:
-        """What was reached until now."""
+        """Results until now."""
         seconds = self._steps * self.plant.step
         return Summary(self.seed, self._steps, seconds, self._reward, self._cost, "stopped")
 
     @property
     def passed(self) -> float:
-        """How many steps have passed, with a part of one."""
+        """Number of passed steps, with the fraction of the present one."""
         return min((self.clock.time() - self._begin) / self.plant.step, self.most)
 
     def values(self) -> dict[str, tuple[float, ...]]:
-        """What all tags have now."""
+        """Present values of all tags."""
         passed = self.passed
         while self._steps <= passed and self._steps < self.most:
             self._advance()
@@ -128,7 +128,7 @@ class _Twin:
         return {name: self._of_tag(tag, part, time) for name, tag in self.plant.tags.items()}
 
     def _of_tag(self, tag: Tag, part: float, time: float) -> tuple[float, ...]:
-        """What a tag has when some part of a step has passed."""
+        """Values of a tag at a fraction of a step."""
         if tag.name.startswith(DATA_PREFIX):
             ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
             series = self._data[tag.name.removeprefix(DATA_PREFIX)]

@@ -1,4 +1,4 @@
-"""Where a plant has the variables of a task."""
+"""Tags: the places of a task's variables on the server of a plant."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from fmugym.logs import declared_as
 __all__ = ["DATA_PREFIX", "Plant", "Tag", "read_plant"]
 
 DATA_PREFIX = "data."
-"""What the names of tags of live data begin with."""
+"""Beginning of the names of tags of live data."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Tag:
         return self.to_task(values[self.own])
 
     def misfit(self, number: float) -> str:
-        """What is strange about a number, which a wrong type would make; "" if nothing is."""
+        """Describe a number that a wrong type would make; "" for a plausible one."""
         width = self.high - self.low
         if math.isinf(width) or self.low - width <= number <= self.high + width:
             return ""
@@ -130,7 +130,7 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
 
 
 def _data(env: TaskEnv, entry: Entry) -> dict[str, Entry]:
-    """Where data come from while the plant runs, by their names in the task."""
+    """Sources of live data, by their names in the task."""
     spellings = Spellings("data", env.task.document.get("data", {}))
     given = entry.child("data").items()
 
@@ -166,7 +166,7 @@ def _tags(env: TaskEnv, entry: Entry, data: Mapping[str, Entry]) -> Iterator[Tag
 
 
 def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
-    """What a tag says of the variable of the FMU, if the task writes or reads one by this name."""
+    """Conversion from a tag to the FMU's variable of this name, if the task uses it."""
     own, unit = declared_as(env, name)
     spec = env.inside.spec
     for one in (*spec.outputs, *spec.inputs):

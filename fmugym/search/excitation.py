@@ -1,4 +1,4 @@
-"""Excitation: actions that show what an FMU does."""
+"""Excitation of an FMU: disturbed actions for the identification of a surrogate."""
 
 from __future__ import annotations
 
@@ -25,42 +25,42 @@ from fmugym.surrogate.surrogate_fit import fit
 __all__ = ["Excitation", "excite", "fitted_surrogate"]
 
 _RANDOM: Final = 0.4
-"""The part of segments with an action at random,"""
+"""Share of segments with a random action."""
 
 _SHIFTED: Final = 0.3
-"""of those that shift the action of the controller,"""
+"""Share of segments in which the action of the controller is shifted."""
 
 _AT_AN_END: Final = 0.3
-"""and of random actions that are an end of their range."""
+"""Share of random actions that are an end of their range."""
 
 _SHIFT: Final = 0.3
-"""The largest shift, as a part of the range."""
+"""Largest shift, as a part of the range."""
 
 _SEEDS: Final = 500_000
-"""Seeds are smaller than those of validations."""
+"""Upper bound of the seeds; seeds of validations are larger."""
 
 _LONGEST: Final = 16
-"""The steps of a segment are between 1 and so many, short ones as often as long ones."""
+"""Longest segment, in steps; short segments are as frequent as long ones."""
 
 
 _STARTS: Final = 32
-"""Starts of episodes without a step, which tell how episodes begin."""
+"""Number of starts without a step, which show the outputs at the beginning of episodes."""
 
 _GROUP: Final = 8
 _OF_PROBE: Final = 20
-"""The look at a task takes one step of so many."""
+"""One step of so many is for the probe of a task."""
 
 _OF_TEST: Final = 4
-"""The test by which controllers are guessed takes one step of so many, at most."""
+"""One step of so many, at most, is for the step test that suggests controllers."""
 
 _EPISODES: Final = 8
-"""Steps are divided among so many episodes, or more if these are shorter."""
+"""Number of episodes among which steps are divided; more if these are shorter."""
 
 
 def fitted_surrogate(
     make_env: Callable[[], Any], steps: int, seed: int = 0, unseen: int = 0
 ) -> tuple[Surrogate, list[Course]]:
-    """Excite an FMU, and fit a surrogate to what it does.
+    """Excite an FMU, and fit a surrogate to the trajectories.
 
     Args:
         make_env: Makes the environment, in the physical form of its task.

@@ -1,4 +1,4 @@
-"""Controllers that a task suggests without declaring them."""
+"""Controllers that step tests of a task suggest."""
 
 from __future__ import annotations
 
@@ -33,27 +33,27 @@ MOST_TESTED: Final = 2000
 """Steps of a test, at most, unless somebody says another number."""
 
 _GAINS: Final = 0.3, 30.0
-"""Gains are tried between these multiples of the inverse of what the plant has."""
+"""Range of tried gains, as multiples of the inverse of the plant's gain."""
 
 _BANDS: Final = 0.01, 0.5
-"""Bands of thermostats are tried between these parts of what the action changes."""
+"""Range of tried bands of thermostats, as parts of the change that the action causes."""
 
 _TRIED: Final = 2
-"""Steps that tell how long a test takes."""
+"""Steps that measure the time of a test."""
 
 _USUAL_STEPS: Final = 100
-"""Those of an episode without an end."""
+"""Assumed length of an episode without an end, in steps."""
 
 _KINDS: Final = "PI", "P"
 _MOST_PAIRINGS: Final = 2
 _MOST_FREE: Final = 10
-"""So many values without a set point may have one that is tuned: those that actions move most,
-beside their limits."""
+"""Most values without a set point for which one is tuned: the values that actions move most,
+relative to their limits."""
 
 
 @dataclass(frozen=True)
 class Loops:
-    """What a task tells of control loops, in which each action controls a measured value.
+    """Control loops of a task, in which each action controls a measured value.
 
     Attributes:
         actions: Their names.
@@ -77,7 +77,7 @@ class Loops:
 
     @classmethod
     def of(cls, document: Mapping[str, Any], env: Any) -> Self | None:
-        """Those of a task.
+        """Find the control loops of a task.
 
         Args:
             document: What it declares.
@@ -111,7 +111,7 @@ class Loops:
 
 
 def _measured(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """What is observed and measured: no set points, data and memory, no forecasts and histories."""
+    """Measured values of the observation: no set points, data, memory, forecasts or histories."""
     given = {
         one for section in ("setpoints", "data", "memory") for one in document.get(section, ())
     }
@@ -121,7 +121,7 @@ def _measured(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:
 
 
 def _setpoints(document: Mapping[str, Any], env: Any) -> dict[str, list[str | float]]:
-    """What measured values may have to be: the other sides of a minus in an expression.
+    """Possible set points of measured values: the other sides of differences in expressions.
 
     Set points come before what is measured itself, and names before numbers.
     """
@@ -279,13 +279,13 @@ class _Guess:
         return wanted
 
     def _free(self) -> list[int]:
-        """The rows whose set point is to be found; not those that only tell what an action is."""
+        """Rows whose set point is to be found, without rows that only tell what an action is."""
         rows = self._moving(has_setpoint=False)
         slow = [row for row in rows if not self.responses.is_instant[row]]
         return sorted(slow or rows, key=self._movement, reverse=True)[:_MOST_FREE]
 
     def _movement(self, row: int) -> float:
-        """How far actions move something, beside its limits."""
+        """Range over which actions move each value, relative to its limits."""
         width = self.loops.widths[self.responses.names[row]]
         largest = float(np.abs(self.responses.ends[:, row]).max())
         moved = float(np.abs(self.responses.gains[row]).max())

@@ -1,4 +1,4 @@
-"""Agents that a search finds, and how they decide: controllers that a network corrects."""
+"""Policies that a search finds: controllers, corrected by a network."""
 
 from __future__ import annotations
 
@@ -49,12 +49,11 @@ _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
 
 PolicyState = tuple[FloatArray, ...]
-"""What a policy keeps from one step to the next: the last observation, its leaky integral, and the
-last action."""
+"""Memory of a policy: the last observation, its leaky integral, and the last action."""
 
 
 def scale_of(moments: FloatArray) -> FloatArray:
-    """What features are like.
+    """Mean and scale of features.
 
     Args:
         moments: The sums of what ``ResidualPolicy.moments`` gives in each step.
@@ -108,7 +107,7 @@ _CHECKS: Final[dict[str, Callable[[str, Any], Any]]] = {
     "names": _names,
     "actions": check_text,
 }
-"""What the file of an agent has, and what may be there."""
+"""Checks of the entries in the file of an agent."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ class ResidualAgent:
     actions: str = ""
 
     def __call__(self, rows: FloatArray) -> ResidualPolicy:
-        """The policy with what was missing, shape (n,) or (N, n), to be bound to N environments.
+        """The policy with the found numbers, shape (n,) or (N, n), for N environments.
 
         Binding it raises ``ConfigError`` if the agent is for another task.
         """
@@ -155,7 +154,7 @@ class ResidualAgent:
         return ResidualPolicy(baseline, replace(self, weights=rows))
 
     def with_numbers(self, found: FloatArray) -> ResidualAgent:
-        """The agent with what was missing, shape (n,)."""
+        """The agent with the found numbers, shape (n,)."""
         if has_range(self.text):
             tunable = search_of(self.text)
             return ResidualAgent(
@@ -218,7 +217,7 @@ class ResidualAgent:
 
     @property
     def features(self) -> int:
-        """How many numbers the network sees."""
+        """Number of inputs of the network."""
         return 3 * self.observed + self.acting if self.history else self.observed
 
     @property
@@ -233,7 +232,7 @@ class ResidualAgent:
         return sum(before * after for before, after in self.shapes)
 
     def extended(self, weights: FloatArray) -> FloatArray:
-        """The weights that decide as those of N linear policies that see the first features only.
+        """Weights of the same decisions as N linear policies of the first features.
 
         This one is linear, too.
 
@@ -322,7 +321,7 @@ class ResidualPolicy(Controller):
         self._memory = self.starts
 
     def _require_size(self) -> None:
-        """Refuse a network that does not fit the task, as that of a damaged file."""
+        """Refuse a network that does not fit the task, such as one of a damaged file."""
         agent, seen = self.agent, len(self.names)
         fits = agent.observed == seen if agent.history else agent.observed <= seen
         if not fits or agent.acting != self.acting:
@@ -344,7 +343,7 @@ class ResidualPolicy(Controller):
         return np.stack(self._step(rows, base), axis=-1)
 
     def _step(self, observed: FloatArray, base: FloatArray) -> list[Any]:
-        """The elements of the action; what ``corrected`` says in formulas."""
+        """Elements of the action; ``corrected`` has the same in formulas."""
         if not self.agent.acting:
             return [*base]
         features = observed[:, : self.agent.observed]
@@ -371,7 +370,7 @@ class ResidualPolicy(Controller):
 
     @property
     def starts(self) -> PolicyState:
-        """What the network sees of the past, at the beginning of an episode."""
+        """Memory of the network at the beginning of an episode."""
         if not self.agent.history:
             return ()
         width = len(self.names)
@@ -384,7 +383,7 @@ class ResidualPolicy(Controller):
         base: Sequence[Value],
         network: Callable[[Sequence[Value]], Sequence[Value]],
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
-        """The formulas of what the network makes of the controller's decision.
+        """Formulas of the corrected action and of the new memory.
 
         Args:
             observation: Its elements.
@@ -406,14 +405,14 @@ class ResidualPolicy(Controller):
         return action, (observation, leaky, self._told(action))
 
     def added(self, changes: Sequence[Any]) -> list[Any] | None:
-        """What the network adds to the action and the controller takes notice of.
+        """Correction of the action, of which the controller takes notice.
 
         A controller that a search corrects takes no notice: None.
         """
         return None
 
     def _with_changes(self, base: Sequence[Any], changes: Sequence[Any]) -> list[Any]:
-        """The elements of the action, of what the controller and the network say."""
+        """Elements of the action, from the controller and the network."""
         if self.choices:
             return list(changes)
         return [
@@ -456,7 +455,7 @@ class ResidualPolicy(Controller):
 def require_task(
     agent: str, own: tuple[Sequence[str], str], here: tuple[Sequence[str], str]
 ) -> None:
-    """Refuse another task than that of an agent.
+    """Refuse a task other than the agent's.
 
     Args:
         agent: What to call it.

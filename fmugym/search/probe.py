@@ -1,4 +1,4 @@
-"""What a search has to know of a task before it begins."""
+"""Probe of a task before a search: its length, speed, observations and first controllers."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _STEPS: Final = 100
 
 _QUICK: Final = 2e-3
 _TRIED: Final = 2
-"""Steps that tell how long all others would take."""
+"""Steps that measure the time of a step."""
 
 _TIMED: Final = 25
 """If a step takes less than this in seconds, as many candidates as in a round tell its time by so
 many steps: the overhead of a call is for all of them."""
 
 MOST_PROBED: Final = _EPISODES * (_ACTIONS * (_TRIED + _STEPS) + FEW * _TIMED)
-"""The steps of a probe, at most. As many count, since how many there are depends on the time."""
+"""Most steps of a probe. All of them count, since the number that is played depends on the time."""
 
 
 _TEST_BY_LOOK: Final = 5
@@ -47,7 +47,7 @@ _TEST_BY_LOOK: Final = 5
 
 @dataclass(frozen=True)
 class Probe:
-    """What is known of a task.
+    """Facts about a task that a search needs.
 
     Attributes:
         task: See ``agent_task``.
@@ -161,7 +161,7 @@ class Probe:
         )
 
     def round_time(self, episodes: int) -> float:
-        """About how many seconds a round of a controller takes, until episodes become longer."""
+        """Estimated seconds of a round of a controller, until episodes become longer."""
         return self.seconds * self.usual_steps * FEW * episodes
 
 
@@ -202,7 +202,7 @@ def _guessed(
 
 
 def agent_task(env: Any) -> dict[str, Any]:
-    """What agents are for: the observations, the action space, and what a task file declares."""
+    """Identity of an agent's task: observations, action space, and the declarations of its file."""
     policy = ResidualPolicy(None).bind(env)
     declared = env.task.document if hasattr(env, "task") else {}
     return {"observations": policy.names, "actions": str(policy.space), **declared}

@@ -1,4 +1,4 @@
-"""Residual policies: controllers to whose actions a network of another library adds."""
+"""Residual policies: controllers, to whose actions a network of another library adds."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Residual(ResidualPolicy):
     # Of arrays.
 
     def seen(self, observation: Any) -> npt.NDArray[np.float32]:
-        """What the model sees, shape (N, k + m); the controller decides."""
+        """Observation of the model, shape (N, k + m); the controller decides first."""
         return self._features(self._rows(observation))
 
     def _features(self, rows: FloatArray) -> npt.NDArray[np.float32]:
@@ -70,7 +70,7 @@ class Residual(ResidualPolicy):
         return np.concatenate([rows, told], axis=1).astype(_SINGLE)
 
     def actions(self, changes: Any) -> Any:
-        """The actions of what the model gives, shape (N, ...), from -1 to 1."""
+        """Actions from the outputs of the model, shape (N, ...), from -1 to 1."""
         return self._as_actions(self._summed(np.asarray(changes, np.float64)))
 
     def _summed(self, changes: FloatArray) -> FloatArray:

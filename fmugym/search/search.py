@@ -20,7 +20,7 @@ from fmugym.search.probe import FEW, Probe
 __all__ = ["VALIDATION", "Search", "tuning_steps"]
 
 VALIDATION: Final = 500_000
-"""Episodes of validation have seeds from here on, those of training have smaller ones."""
+"""First seed of validation; episodes of training have smaller ones."""
 
 _FINAL: Final = VALIDATION + 1000
 """The first seed of the last validation, in which all candidates compete."""
@@ -42,8 +42,7 @@ episodes of all rounds."""
 
 _TRIAL: Final = 5
 _TUNING: Final = 20
-"""Rounds for the numbers of each controller, and in all for those of the best one. A constant
-action is one, too."""
+"""Rounds for each controller, also a constant action, and in all for the best one."""
 
 _A_NUMBER: Final = 6
 """The best one has at least so many for each of its numbers."""
@@ -58,10 +57,10 @@ after so many starts in a row, the first one included, that were in vain."""
 
 _RANDOM: Final = 32
 _BEST_PART: Final = 4
-"""Of so many candidates with weights at random, this part tells what observations are like."""
+"""One of so many candidates with random weights counts for the scale of observations."""
 
 _FINEST: Final = 1e-3
-"""The size of the weights of the finest ones; that of the coarsest ones is 1."""
+"""Size of the finest weights; the coarsest ones have 1."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
@@ -73,8 +72,8 @@ _MERIT: Final = attrgetter("merit")
 
 _OF_NETWORKS: Final = 4.0
 _OF_CORRECTIONS: Final = 0.4
-"""The first steps of the weights are 1, so many times as large in networks, and where they correct
-a controller."""
+"""First steps of the weights of networks, and of weights that correct a controller, as multiples of
+the usual first step."""
 
 
 def tuning_steps(most_steps: int | None, is_same: bool) -> int:
@@ -128,7 +127,7 @@ class Search:
 
     @property
     def random_state(self) -> Mapping[str, Any]:
-        """Where the random numbers are: integers and texts by name."""
+        """State of the random numbers: integers and texts by name."""
         return dict(self.rng.bit_generator.state)
 
     @random_state.setter
@@ -142,7 +141,7 @@ class Search:
 
     @property
     def tuning(self) -> CandidateSearch | None:
-        """The controller whose numbers are sought next, at last those of the best one alone."""
+        """Controller to tune next; in the end, the best one alone."""
         new = min(self.controllers, key=attrgetter("rounds"))
         best = max(self.controllers, key=_MERIT)
         found = new if new.rounds < _TRIAL else best
@@ -155,13 +154,13 @@ class Search:
 
     @property
     def ahead(self) -> CandidateSearch:
-        """Who has the best agent in validation."""
+        """Search with the best agent in validation."""
         return max(self.controllers + self.policies, key=_MERIT)
 
     # Rounds.
 
     def advance(self, evaluator: CandidateEvaluator) -> None:
-        """Go on by one round, or by one that tells what observations are like."""
+        """Play one round, or one that measures the observations."""
         if self.tuning:
             self._play(self.tuning, evaluator)
         elif self.widths:
@@ -184,7 +183,7 @@ class Search:
         return ([one for one in ranked if one.merit > self.baseline.merit] or ranked)[:2]
 
     def _next(self, leaders: Sequence[CandidateSearch]) -> CandidateSearch:
-        """Who plays: one that has had less than its share, or else the leaders by turns."""
+        """Choose the next to play: one with less than its share, or the leaders by turns."""
         behind = [one for one in self._active if one.rounds < self.rounds // _SHARE]
         return behind[0] if behind else min(leaders, key=attrgetter("last_round"))
 
@@ -213,7 +212,7 @@ class Search:
         return range(first, first + (1 if self.probe.is_same else count))
 
     def revalidate(self, evaluator: CandidateEvaluator) -> None:
-        """Go on in another environment: merits become those that the agents have there."""
+        """Continue in another environment, with the merits that the agents have there."""
         for one in (*self.controllers, *self.policies):
             one.lead, one.starts, one.gained = NO_MERIT, 0, one.rounds
             if one.best:
@@ -237,7 +236,7 @@ class Search:
         return CMA(mean, sigma, population, self.rng, largest=_LARGEST, growth=_GROWTH)
 
     def _look(self, evaluator: CandidateEvaluator, baseline: ResidualAgent) -> None:
-        """See what observations are like for the best of some candidates that correct the baseline.
+        """Measure observations under the best of some candidates that correct the baseline.
 
         Policies that are worth something see the like, while others may drive the process far away.
         Some change little: only these keep an unstable process near. In a first look they add
@@ -258,7 +257,7 @@ class Search:
             self._enter(history, baseline)
 
     def _enter(self, history: ResidualAgent, baseline: ResidualAgent) -> None:
-        """Let classes of policies enter. Linear ones are followed by those that see the past."""
+        """Add classes of policies; linear ones are followed by policies that see the past."""
         linear = self.probe.linear
         *linear_ones, network = (
             replace(one, scale=self.scale[:, : one.features])
@@ -273,7 +272,7 @@ class Search:
     # Who wins.
 
     def last_validation(self) -> tuple[list[ResidualAgent], range]:
-        """Who would compete if the search ended now, and the seeds of the episodes.
+        """Agents that would compete if the search ended now, and the seeds of the episodes.
 
         These are the baseline and the best two searches, each by its best numbers and by its
         present mean. That may be better, without having shown it in the fewer episodes of earlier

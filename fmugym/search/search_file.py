@@ -1,4 +1,4 @@
-"""The file of a search: its numbers and texts, from which it goes on as if nothing had happened.
+"""File of a search, from which the search continues exactly.
 
 The file is an ``.npz`` archive of NumPy: arrays of numbers, and a text of JSON with all else, in
 which the names of arrays stand for them. It holds nothing that could run.
@@ -37,7 +37,7 @@ _MOST: Final = 1_000_000
 
 
 def plain_of(value: Any) -> Any:
-    """What JSON keeps of a value: of a task, what tells it from others."""
+    """Convert a value to the form in which JSON keeps it; for a task, its identity."""
     return json.loads(json.dumps(value, default=_plain))
 
 
@@ -133,7 +133,7 @@ def search_in(content: bytes) -> Search:
 
 
 class _Reader:
-    """Makes objects of facts, and refuses those that cannot be.
+    """Reader of objects from their facts, which refuses impossible ones.
 
     Args:
         arrays: By name.
@@ -235,7 +235,7 @@ class _Reader:
 
 
 def _size_of(agent: ResidualAgent) -> int:
-    """How many numbers of an agent are sought."""
+    """Number of sought numbers of an agent."""
     return len(search_of(agent.text).ranges) if has_range(agent.text) else agent.size
 
 

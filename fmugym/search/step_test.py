@@ -1,4 +1,4 @@
-"""Step responses of a task: what each action does to each observation in the end."""
+"""Step responses of a task: the final change of each observation by each action."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FEWEST: Final = 2 * _QUARTERS
 """A response of so many steps tells nothing."""
 
 _NOTHING: Final = 1e-6
-"""A response that is smaller than this part of what is observed is none."""
+"""A response below this part of the observed magnitude counts as none."""
 
 _AGREEMENT: Final = 0.5
 """The least ratio of the mean of all responses to that of their magnitudes; below it, the sign
@@ -53,7 +53,7 @@ _AT_ONCE: Final = 0.9
 
 @dataclass(frozen=True)
 class StepResponses:
-    """What k observations do if each of n actions is stepped.
+    """Responses of k observations to steps of n actions.
 
     Attributes:
         names: Of the observations.
@@ -71,7 +71,7 @@ class StepResponses:
 
     @cached_property
     def _means(self) -> FloatArray:
-        """Those of all steps, shape (5, k, n)."""
+        """Means of all steps, shape (5, k, n)."""
         known = np.isfinite(self.responses[..., :1, :1])
         count = np.maximum(known.sum(axis=0), 1)
         means: FloatArray = (np.where(known, self.responses, 0.0).sum(axis=0) / count).T
@@ -119,14 +119,14 @@ class StepResponses:
 
     @property
     def is_instant(self) -> BoolArray:
-        """Which observations tell what an action is: they do not change later, shape (k,)."""
+        """Whether each observation follows an action at once and never after, shape (k,)."""
         first, last = np.abs(self._means[[0, -1]])
         instant: BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
         return instant
 
 
 class _Held(Controller):
-    """Holds an action in each environment, and keeps what is observed."""
+    """Holds an action in each environment, and records observations."""
 
     def __init__(self, actions: FloatArray) -> None:
         self.actions = actions
@@ -142,12 +142,12 @@ class _Held(Controller):
         return np.ones((1, self.count))
 
     def course(self, length: int) -> FloatArray:
-        """What was observed in so many steps, shape (length, N, k); the last one is repeated."""
+        """Observations of so many steps, shape (length, N, k); the last one is repeated."""
         return np.stack([*self.rows, *self.rows[-1:] * (length - len(self.rows))])
 
 
 def episodes_of(actions: int) -> int:
-    """How many episodes the test of so many actions has."""
+    """Number of episodes of a test of so many actions."""
     return len(_POINTS) * (1 + 2 * actions)
 
 
@@ -181,7 +181,7 @@ def step_test(
 def _played(
     evaluator: CandidateEvaluator, actions: FloatArray
 ) -> tuple[tuple[str, ...], list[FloatArray]]:
-    """Play an episode with each action; returns what is observed, each of shape (T, k)."""
+    """Play an episode with each action; returns observations, each of shape (T, k)."""
     controllers: list[_Held] = []
     jobs = []
 

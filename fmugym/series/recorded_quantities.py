@@ -1,4 +1,4 @@
-"""Which values of environments a recorder writes down, and how it reads them."""
+"""Recorded quantities: the values of environments that a recorder reads and writes down."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _VARYING: Final = ("continuous", "discrete")
 
 
 class RecordedEnvs(Protocol):
-    """N environments to read.
+    """Interface of N environments that a recorder reads.
 
     Attributes:
         prototype: One of them.
@@ -45,7 +45,7 @@ class RecordedEnvs(Protocol):
 
 
 class RecordedQuantities(NamedTuple):
-    """The values that a recorder writes down.
+    """Quantities that a recorder writes down.
 
     Attributes:
         quantities: All of them, in the order of the columns.
@@ -62,7 +62,7 @@ class RecordedQuantities(NamedTuple):
     observed: tuple[int, ...]
 
     def present(self, episodes: RecordedEnvs, indices: Any) -> FloatArray:
-        """What M environments have at this moment, all but the observations.
+        """Present values of M environments, without the observations.
 
         Args:
             episodes: All environments.
@@ -77,7 +77,7 @@ class RecordedQuantities(NamedTuple):
         return np.concatenate(rows).T
 
     def seen(self, observations: Any, indices: Any) -> FloatArray:
-        """What M environments observe; nothing if observations are no arrays.
+        """Observations of M environments; no values if observations are no arrays.
 
         Args:
             observations: Those of all environments.
@@ -170,7 +170,7 @@ def _varies(variable: Variable) -> bool:
 
 
 def quantities_of(env: FMUEnv) -> Quantities:
-    """Everything in a task that has a name and a value: as declared, or else the config's."""
+    """Quantities of a task, or of the config if there is no task."""
     of_task = env.inside.quantities
     return _of_config(env) if of_task is None else of_task()
 
@@ -204,7 +204,7 @@ def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
 
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
-    """The numbers of the FMU for which the task has no name of its own."""
+    """Numbers of the FMU for which the task has no name of its own."""
     known = {*env.inside.interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
         if variable.is_number:

@@ -1,4 +1,4 @@
-"""Wrappers that write time series down while an environment is used."""
+"""Recorders: wrappers that write time series while an environment is used."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["RecordSeries", "RecordVectorSeries"]
 
 
 class _Recorder:
-    """What both wrappers share.
+    """Common part of the two recorders.
 
     Args:
         episodes: The environments.
@@ -78,7 +78,7 @@ class _Recorder:
         self._add(self._rows.add(outcome, idle))
 
     def present(self) -> FloatArray:
-        """What the environments have at this moment; see ``Choice.present``."""
+        """Present values of the environments; see ``RecordedQuantities.present``."""
         return self._choice.present(self.episodes, self._indices)
 
     def _add(self, rows: TimeSeries) -> None:
@@ -87,7 +87,7 @@ class _Recorder:
 
     @property
     def series(self) -> TimeSeries:
-        """What was written down until now."""
+        """Time series until now."""
         if self._memory is None:
             raise SimulationError("there is no recording before the first reset")
         rows: TimeSeries = self._memory.rows()
@@ -137,7 +137,7 @@ class _One:
 
 
 class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Writes down what an environment does, one row for each step.
+    """Recorder of an environment, which writes one row for each step.
 
     The first row of an episode is the moment after the reset. Rewards and costs in a row are those
     of the step that led to it.
@@ -176,7 +176,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def series(self) -> TimeSeries:
-        """What was written down until now.
+        """Time series until now.
 
         Raises:
             SimulationError: Before the first reset.
@@ -233,7 +233,7 @@ class _Many:
 
 
 class RecordVectorSeries(VectorWrapper):
-    """Writes down what the environments of a vector environment do; see ``RecordSeries``.
+    """Recorder of a vector environment; see ``RecordSeries``.
 
     In the mode ``SAME_STEP``, an FMU is in its next episode when the step returns. The last row of
     an episode has the values at its end nevertheless: the recorder reads them within the step.
@@ -270,13 +270,13 @@ class RecordVectorSeries(VectorWrapper):
             env.inside.look_at_ends(self._look)
 
     def _look(self, actions: Any) -> None:
-        """Read what environments have before the next episodes begin."""
+        """Read the values of environments before the next episodes begin."""
         self._envs.actions = np.array(actions)
         self._at_end = self._recorder.present()
 
     @property
     def series(self) -> TimeSeries:
-        """What was written down until now.
+        """Time series until now.
 
         Raises:
             SimulationError: Before the first reset.
@@ -335,7 +335,7 @@ class RecordVectorSeries(VectorWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _last(self, infos: Any, observations: Any, ended: MaskArray) -> dict[str, Any]:
-        """With what episodes have ended, as an ``RecordedStep`` has it, in the mode SAME_STEP."""
+        """Last values of ended episodes in the mode SAME_STEP, as ``RecordedStep`` has them."""
         seen = observations
         if isinstance(observations, np.ndarray):
             seen = observations.copy()

@@ -1,4 +1,4 @@
-"""From the results of steps to rows of time series, for one environment or N of them."""
+"""Rows of time series, made of the results of steps of one environment or N."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ class Infos(NamedTuple):
         return [name for name in self.of_envs.get(group, ()) if not name.startswith("_")]
 
     def numbers(self, *path: str) -> FloatArray:
-        """The numbers at a place in the infos, shape (N,); 0 where there are none."""
+        """Numbers under a key of the infos, shape (N,); 0 for environments without one."""
         now = _numbers(self.of_envs, path, self.num_envs)
         last = _numbers(self.last, path, self.num_envs) if self.last else now
         return np.where(self.ended, last, now)
 
     def each(self, name: str) -> dict[int, Any]:
-        """The values of those environments that have one."""
+        """Values under a key, for the environments that have one."""
         ended = {*np.flatnonzero(self.ended).tolist()}
         now = {i: one for i, one in _each(self.of_envs, name).items() if i not in ended}
         return now | _each(self.last, name)
@@ -87,7 +87,7 @@ def _one(values: Any, index: int) -> Any:
 
 
 class RecordedStep(NamedTuple):
-    """What a step of N environments has given.
+    """Results of a step of N environments.
 
     Attributes:
         rewards, terminated, truncated: Shape (N,).
@@ -107,7 +107,7 @@ class RecordedStep(NamedTuple):
 
 
 class RowMaker:
-    """Makes rows of what environments do.
+    """Maker of rows from the steps of environments.
 
     Args:
         episodes: The environments.
@@ -192,7 +192,7 @@ class RowMaker:
         return block
 
     def _values(self, observations: Any, infos: Infos) -> FloatArray:
-        """What they have, and what they observe; not what a plant has failed to tell."""
+        """Values and observations of the environments; a plant may lack some values."""
         seen = self._choice.seen(observations, self._indices)
         now = self._choice.present(self._episodes, self._indices)
         values = np.concatenate([now, seen], axis=1)

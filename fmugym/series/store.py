@@ -1,4 +1,4 @@
-"""Where the rows of a recorder go: memory, a CSV file, a Parquet file."""
+"""Stores for the rows of a recorder: memory, a CSV file, a Parquet file."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def _figure(values: Any, column: Quantity) -> float:
 
 
 def courses(series: TimeSeries) -> Iterator[tuple[Quantity, tuple[float | None, ...]]]:
-    """Sum up the course of variables in an episode; those without any value are left out.
+    """Summarize each variable over an episode, without variables that never have a value.
 
     Yields:
         The variable; its least, mean, greatest and last value, and the mean absolute difference

@@ -23,7 +23,7 @@ __all__ = ["TimeSeries"]
 
 @dataclass(frozen=True)
 class TimeSeries:
-    """What a recorder has written down, one row for each moment.
+    """Table that a recorder has written, one row for each moment.
 
     Attributes:
         columns: What the columns are. Beside the kinds of ``fmugym.task.quantity``, there are
@@ -61,7 +61,7 @@ class TimeSeries:
 
     @property
     def units(self) -> dict[str, str]:
-        """The units by name, where they are known."""
+        """Known units by name."""
         return {column.name: column.unit for column in self.columns if column.unit}
 
     def episodes(self) -> dict[tuple[int, int], TimeSeries]:

@@ -138,7 +138,7 @@ def _evaluations(graph: Mapping[int, Sequence[int]], loop: Loop) -> Iterator[Eva
 
 
 def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, tuple[str, ...]]:
-    """For each component, those that are in algebraic loops with it, and itself."""
+    """For each component, the components in algebraic loops with it, and itself."""
     team = {name: {name} for name in names}
     for loop in loops:
         union = set().union(*(team[end] for link in loop for end in (link.source, link.target)))
@@ -153,7 +153,7 @@ def _order_of_teams(
     links: Sequence[Link],
     told: Mapping[str, Feedthrough],
 ) -> tuple[list[tuple[str, ...]], tuple[Link, ...]]:
-    """Order the teams. Those that ask for each other's new values stay in the order of names."""
+    """Order the teams; teams in one cycle stay in the order of names."""
     acting = [
         link for link in links if _acts(link, told) and teams[link.source] != teams[link.target]
     ]

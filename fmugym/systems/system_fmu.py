@@ -19,7 +19,7 @@ __all__ = ["SystemFMU"]
 
 
 class SystemFMU(FMU):
-    """A system that can stand where an ``FMU`` can.
+    """A system with the interface of an ``FMU``.
 
     Args:
         plan: What to execute.
@@ -66,7 +66,7 @@ class SystemFMU(FMU):
         return all(fmu.bundled for fmu in self._opened)
 
     def parts_in(self, folder: Path) -> list[tuple[FMU, Path]]:
-        """The FMUs of the components, and where each is in a folder like ``extract``'s."""
+        """FMUs of the components, with the place of each in a folder like ``extract``'s."""
         return [(fmu, folder / str(number)) for number, fmu in enumerate(self._opened)]
 
     @cached_property
@@ -76,7 +76,7 @@ class SystemFMU(FMU):
 
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
-        """What keeps the components from being loaded; see ``FMU.obstacles``."""
+        """Reasons why the components cannot be loaded; see ``FMU.obstacles``."""
         of_components = (
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()

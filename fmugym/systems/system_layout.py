@@ -1,4 +1,4 @@
-"""Where the values of a system are: slots of inputs and outputs, and the routes between them.
+"""Memory layout of a system: slots of inputs and outputs, and the routes between them.
 
 ``fmugym.pool.form`` tells it to ``native/system_steps.c``.
 """
@@ -21,7 +21,7 @@ __all__ = ["PartLayout", "Route", "SystemLayout", "array_key"]
 
 @dataclass
 class PartLayout:
-    """What a step sets and gets of one component.
+    """Inputs and outputs of one component that a step sets and gets.
 
     Attributes:
         component: Of the plan.
@@ -40,7 +40,7 @@ class PartLayout:
 
     @property
     def label(self) -> str:
-        """Names it in messages."""
+        """Name in messages."""
         return f"component {self.component.name!r}"
 
     @property
@@ -50,12 +50,12 @@ class PartLayout:
 
     @cached_property
     def starts(self) -> tuple[tuple[Variable, float | str], ...]:
-        """What the plan sets before the initialization."""
+        """Start values that the plan sets before the initialization."""
         starts = self.component.starts
         return tuple((self.description.variable(name), value) for name, value in starts)
 
     def starts_of(self, variables: Iterable[Variable]) -> list[float]:
-        """What numeric scalars and elements of this component start with."""
+        """Start values of numeric scalars and elements of this component."""
         known = dict(self.component.starts)
         return [float(known.get(one.name, one.start_number)) for one in variables]
 
@@ -142,7 +142,7 @@ class SystemLayout:
         return tuple(sorted(routes, key=lambda route: route.target))
 
     def ends_of(self, variable: Variable) -> tuple[PartVariable, ...]:
-        """What stands behind a variable of the system."""
+        """Variables of components behind a variable of the system."""
         return self.description.ends[variable.value_reference]
 
     def input_slot(self, end: PartVariable) -> int:
@@ -203,12 +203,12 @@ _Slots: TypeAlias = dict[tuple[int, *_Key], int]
 
 
 def _key(variable: Variable) -> _Key:
-    """What identifies a value of an FMU; value references of FMI 1.0 and 2.0 have a type."""
+    """Identity of a value of an FMU; value references of FMI 1.0 and 2.0 need the type."""
     return variable.value_reference, variable.kind, variable.place, variable.negated
 
 
 def array_key(end: PartVariable) -> tuple[int, int, str]:
-    """What identifies the array that an element belongs to."""
+    """Identity of the array of an element."""
     return end.part, end.variable.value_reference, end.variable.kind
 
 

@@ -1,4 +1,4 @@
-"""What the master of a system executes, as data.
+"""Execution plan of a system's master, as data.
 
 A plan holds names and numbers only: it can be pickled, compared and hashed. Whoever makes one
 (Python, a task file, an SSP archive) has resolved units into gains and offsets, and has put the

@@ -1,4 +1,4 @@
-"""What follows from the components and connections of a system: its order and its plan."""
+"""Wired systems: components and connections, with the order and the plan that follow from them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from fmugym.systems.wiring import Port, Wiring
 __all__ = ["LOOPS", "SYSTEM", "WiredSystem"]
 
 LOOPS: Final = ("newton", "refuse")
-"""What is done about algebraic loops."""
+"""Treatments of algebraic loops."""
 
 
 SYSTEM: Final = Table(
@@ -187,7 +187,7 @@ class WiredSystem:
 
     @cached_property
     def findings(self) -> tuple[str, ...]:
-        """What is doubtful in the system and in its FMUs, as texts."""
+        """Doubtful facts about the system and its FMUs, as texts."""
         untold = [
             f"{name} does not tell its direct feed-through; each output is taken to depend on all "
             "inputs"
@@ -203,7 +203,7 @@ class WiredSystem:
 
     @cached_property
     def plan(self) -> SystemPlan:
-        """What the master executes."""
+        """Execution plan of the master."""
         times = dict(self.times)
         if times["step_size"] is None:
             times["step_size"] = self._smallest_step()
@@ -257,7 +257,7 @@ def _findings_of(order: SystemOrder) -> Iterator[str]:
 
 
 def _told_loop(loop: Sequence[Link]) -> str:
-    """The links of a loop one after the other, as far as each begins where another ends."""
+    """Links of a loop one after the other, as far as each begins at the end of another."""
     rest = list(loop)
     chain = [rest.pop(0)]
     while rest:

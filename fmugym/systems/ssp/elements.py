@@ -1,4 +1,4 @@
-"""What a SystemStructure.ssd file says, as data."""
+"""Elements of a SystemStructure.ssd file, as data."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class Wire:
 
 @dataclass
 class SystemElement:
-    """A system and what is in it.
+    """A system and its elements.
 
     Attributes:
         name, connectors, bindings: See ``Element``.
@@ -192,7 +192,7 @@ def read_system(xml: Any, findings: list[str]) -> SystemElement:
 
 
 def ignored(root: Any) -> list[str]:
-    """Say what of a file has no effect: annotations and geometry."""
+    """Describe the parts of a file that have no effect: annotations and geometry."""
     types = Counter(one.get("type") for one in root.iter("{*}Annotation"))
     shapes = Counter(one.tag.rpartition("}")[2] for one in root.iter("{*}*"))
     return [
@@ -255,7 +255,7 @@ def scaling_of(xml: Any) -> Conversion:
 
 
 def unit_of(xml: Any) -> str | None:
-    """The unit of a number; tools write an empty one where there is none."""
+    """Unit of a number; tools write an empty one for none."""
     return xml.get("unit") or None
 
 

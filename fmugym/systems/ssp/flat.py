@@ -1,4 +1,4 @@
-"""Nested systems made flat: which component drives which, and what starts where.
+"""Nested systems, flattened to components, connections between them and start values.
 
 A node is a connector of a component or a system, named by the path of its element and its own name.
 Connections make a forest of nodes: every node has one source at most.
@@ -30,7 +30,7 @@ _Node = tuple[Path, str]
 
 @dataclass(frozen=True)
 class _Value:
-    """A value on its way: what has become of it, and its unit; None if that is not known.
+    """A value on its way through connectors, with its gain, offset and unit; None if unknown.
 
     ``units`` has the definition of the unit.
     """
@@ -223,7 +223,7 @@ class Flat:
         return _Value(scaling.after(conversion.after(value.change)), *known)
 
     def _unit(self, node: _Node) -> str | None:
-        """The unit of a connector; an FMU knows best what its variable has."""
+        """Unit of a connector; the FMU's own unit takes precedence."""
         place, name = node
         variable = self._variable(node)
         if variable is not None and variable.unit is not None:
