@@ -261,7 +261,7 @@ def check_text(what: str, value: Any) -> str:
 
 
 def check_option(kind: str, value: Any, known: Iterable[str]) -> str:
-    """Return a value that is one of some texts.
+    """Return a value if it is one of some texts.
 
     Raises:
         ConfigError: With the nearest of them.
@@ -385,7 +385,7 @@ class Spellings:
 def by_own_names(
     what: str, given: Mapping[str, _Value], own_name: Callable[[str], str]
 ) -> dict[str, _Value]:
-    """What is given by names, by the own names of what these stand for.
+    """Resolve the names of a dict to the own names of the named things.
 
     Args:
         what: What is given, for the error.

@@ -1,4 +1,4 @@
-"""The config of an environment: a dict as the user writes it, checked once and frozen."""
+"""Config of an environment: a dict of the user, checked once and frozen."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ ON_FAULT: Final = ("truncate", "terminate", "raise")
 _INFOS: Final = frozenset(
     {"cost", "costs", "drawn", "fault", "fault_rate", "fmu_terminated", "reward_terms"}
 )
-"""What infos have of their own."""
+"""Keys that infos have of their own."""
 
 MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
@@ -156,7 +156,7 @@ def _expression(what: str, value: Any) -> Expression:
 _EXPRESSION: Final = {"title": "expression", "type": ["number", "string", "boolean"]}
 
 EXPRESSION: Final = Kind(lambda _, value: Expression.parse(value), _EXPRESSION)
-"""An expression where the caller says in which key it stands."""
+"""Kind of an expression; the caller adds its key to messages."""
 
 _NAMED_EXPRESSION: Final = Kind(_expression, _EXPRESSION)
 
@@ -185,7 +185,7 @@ NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number", 
 
 @dataclass(frozen=True)
 class Foreign(KnownArguments):
-    """How an FMU of unknown quality is opened and run; see ``docs/foreign.md`` for the keys.
+    """Settings for an FMU of unknown quality; see ``docs/foreign.md`` for the keys.
 
     Raises:
         ConfigError: For values of the wrong type or range; it names all of them.
@@ -252,7 +252,7 @@ FOREIGN: Final = table_of_fields(Foreign, what="key of 'foreign'", make=Foreign)
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """How an environment drives its FMU. All times are in simulated seconds.
+    """Config of an environment. All times are in simulated seconds.
 
     Numbers may be given in any type; the attributes are Python floats and integers. Attributes are
     the keys of a config; ``docs/config.md`` lists them.
@@ -457,7 +457,7 @@ class EnvConfig:
 
     @property
     def variable_starts(self) -> dict[str, Any]:
-        """What episode variables are at the beginning of an episode, the memory among them."""
+        """Start values of episode variables, the memory among them."""
         return {name: one["start"] for name, one in self.memory.items()} | dict(
             self.episode_variables
         )

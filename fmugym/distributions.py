@@ -1,4 +1,4 @@
-"""Distributions from which an environment draws values at each reset.
+"""Distributions of start values and parameters, which an environment draws at each reset.
 
 Wherever a config takes a number for a start value, a parameter or an episode variable, it also
 takes a distribution. The environment then draws from it with its own seeded generator.
@@ -57,7 +57,7 @@ class Distribution(Protocol):
 
 
 class Recipe(NamedTuple):
-    """How the C extension draws the values of ``sample``, to the last bit.
+    """Form of a distribution in which the C extension draws exactly the values of ``sample``.
 
     Attributes:
         kind: One of the kinds of ``native/draws.h``.
@@ -175,7 +175,7 @@ class Normal(KnownArguments):
 
 @dataclass(frozen=True)
 class Choice(KnownArguments):
-    """One of the given values, with equal or the given probabilities.
+    """Distribution over some values, with equal or the given probabilities.
 
     The values are numbers; for a parameter that is an Enumeration they may be names of its items.
 
@@ -289,7 +289,7 @@ _MOST_REDRAWS: Final = 10_000
 
 
 def support_of(distribution: Any) -> tuple[float, float]:
-    """The lowest and the highest value that can be drawn; infinite where that is not known."""
+    """Lowest and highest possible value; infinite if it is not known."""
     if isinstance(distribution, Choice):
         values = list(map(float, distribution.values))
         return min(values), max(values)
@@ -441,7 +441,7 @@ def recipe_of(distribution: Any, convert: Callable[[Any], float]) -> Recipe | No
 
 
 def _items(values: Any) -> list[Any]:
-    """The elements of what should be a list; none if it is no list."""
+    """Elements of a list; none for other values."""
     if isinstance(values, str | bytes) or not isinstance(values, Iterable):
         return []
     try:

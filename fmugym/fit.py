@@ -1,4 +1,4 @@
-"""Parameters of a task's FMU from logs of the plant, and the rows that a task draws from them.
+"""Fit of a task's FMU to logs of the plant, and the parameter rows that a task draws from it.
 
 ::
 
@@ -43,10 +43,10 @@ _WASH_IN: Final = 0.1
 """Of the shortest log, the part that is not counted if nobody says another."""
 
 _ROWS: Final = 1000
-"""How many are written."""
+"""Number of written rows."""
 
 _OFF: Final = 1e-3
-"""How far from a step the rows of means may be, as a part of it."""
+"""Tolerated deviation of a row of means from a step, as a part of it."""
 
 
 def fit_logs(
@@ -125,7 +125,7 @@ def write_rows(fit: FitResult, path: str | os.PathLike[str]) -> None:
 
 
 class _Plant:
-    """The task's side of a fit: names, units, and what is given."""
+    """Task of a fit: names, units and given values."""
 
     def __init__(self, env: Any, columns: dict[str, str]) -> None:
         self.env, self._columns = inner_env(env), columns
@@ -137,7 +137,7 @@ class _Plant:
         }
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:
-        """The episodes of a log, in the units of the FMU; what was not measured parts them."""
+        """Episodes of a log in the units of the FMU, divided at missing measurements."""
         spec, columns = self.env.inside.spec, LogColumns(self.env, log, self._columns)
         for variable in spec.inputs:
             columns.require(variable)
@@ -160,7 +160,7 @@ class _Plant:
             )
 
     def require_steps(self, trajectories: Sequence[Trajectory]) -> None:
-        """Refuse rows that are no steps apart, if a measured value is that of a whole step."""
+        """Refuse rows that are not a step apart, if a measured value is the mean of a step."""
         spec, step = self.env.inside.spec, median_interval(trajectories)
         whole = [v for v in spec.outputs if v.sampling != "last"]
         sampled = [f"{v.sampling} of {v.name}" for v in whole if v.name in trajectories[0].outputs]

@@ -1,4 +1,4 @@
-"""Keys of configs, task files and systems, each of which is declared once.
+"""Keys of configs, task files and systems: kinds, checks and descriptions, declared once.
 
 Kinds and tables are data. ``checked_entry`` and ``with_paths`` read them, and so does
 ``docs/_site/keys.py``, which writes the tables of the documents and the JSON Schema for editors.
@@ -149,7 +149,7 @@ class Key(NamedTuple):
 
 
 class Mistake(NamedTuple):
-    """What is wrong with a value.
+    """Mistake in a value.
 
     Attributes:
         keys: The keys that lead to it.
@@ -351,7 +351,7 @@ def check_fields(made: Any) -> None:
 
 
 def option(*known: str) -> Kind:
-    """One of some texts."""
+    """Make the kind of a choice among some texts."""
     return Kind(partial(check_option, known=known), {"enum": list(known)})
 
 

@@ -1,4 +1,4 @@
-"""Logs of a plant, played through a task: rewards, observations and ends without the FMU's code.
+"""Log of a plant, played through a task: rewards, observations and ends without the FMU.
 
 ::
 
@@ -61,7 +61,7 @@ _SAME_TIME: Final = 1e-9
 """Times that differ by less, in seconds, are the same."""
 
 _PROPOSED: Final = "proposed."
-"""What the names of columns of proposals begin with."""
+"""Beginning of the names of columns of proposals."""
 
 _MOST_ACTIONS: Final = 10_000
 """The most actions of discrete spaces that are tried out for a row."""
@@ -69,7 +69,7 @@ _MOST_ACTIONS: Final = 10_000
 
 @dataclass(frozen=True)
 class PlantLog:
-    """What a plant has measured.
+    """Measurements of a plant.
 
     Columns are also found by names whose letters only look other; see ``find``.
 
@@ -218,7 +218,7 @@ def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, DataColumn], dict[
 def _times(
     time: DataColumn, zone: datetime.tzinfo | None, standard: int | None
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """The times in seconds, without those of 29 February, and which rows they are of."""
+    """Times in seconds without 29 February, and the rows of these times."""
     if time.is_numeric:
         return time.numbers, np.ones(len(time.rows), np.bool_)
     dates = time.dates_in(zone)
@@ -236,7 +236,7 @@ def _times(
 
 
 def _episodes(times: FloatArray, is_known: npt.NDArray[np.bool_]) -> FloatArray:
-    """Numbers of the episodes, which end at gaps, and where the time goes back."""
+    """Numbers of the episodes, which end at gaps, and at times that go back."""
     usual, distances = usual_distance(times), np.diff(times, prepend=times[:1])
     is_gap = distances > (math.inf if usual is None else 2 * usual * (1 + 1e-6))
     left_out = np.diff(np.cumsum(~is_known)[is_known], prepend=0) > 0
@@ -312,7 +312,7 @@ class _Plant:
 
     @property
     def left(self) -> int:
-        """How many steps are left."""
+        """Number of steps that are left."""
         return len(self.rows) - 1 - self.row
 
     def reset(self, start_values: Mapping[str, Any]) -> dict[str, float]:
@@ -462,7 +462,7 @@ class LogColumns:
             raise unknown_name("column of the log", variable.name, self._columns)
 
     def range_of(self, variable: Variable) -> float:
-        """How far apart the values of a variable are; 1 if they are all the same."""
+        """Width of the range of a variable; 1 if all values are the same."""
         self.require(variable)
         column, to_log = self._from[variable.name]
         values = to_log.inverse(self._columns[column])
@@ -555,7 +555,7 @@ class Actions:
         return action
 
     def inputs(self, action: Any) -> FloatArray:
-        """What the environment would write for an action, one number for each input."""
+        """Inputs that the environment would write for an action, one number for each."""
         env, before = self._env, self._env.action
         env.action = action
         try:

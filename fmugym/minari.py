@@ -1,4 +1,4 @@
-"""Recordings as datasets of Minari, for learning from them offline, and back.
+"""Datasets of Minari for offline learning, made of recordings, and back.
 
 Needs the extra ``minari``. See ``docs/datasets.md``.
 """
@@ -31,7 +31,7 @@ except ImportError as error:
 __all__ = ["read_dataset", "write_dataset"]
 
 _KEY: Final = "fmugym"
-"""Where the options of an episode keep what a ``Recording`` knows besides numbers."""
+"""Key of an episode's options for the facts of a ``Recording`` besides numbers."""
 
 
 def write_dataset(
@@ -134,7 +134,7 @@ def _stacked(space: Space[Any], rows: npt.NDArray[Any]) -> Any:
 
 
 def _facts_of(metadata: Any, dataset: minari.MinariDataset) -> dict[str, Any]:
-    """What ``_buffer`` has put into the options; the storages of Minari nest them differently."""
+    """Facts that ``_buffer`` has put into the options; storages of Minari nest them differently."""
     text = metadata.get(f"options/{_KEY}") or metadata.get("options", {}).get(_KEY)
     if text is None:
         raise ConfigError(

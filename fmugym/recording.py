@@ -57,7 +57,7 @@ _MOST_BYTES: Final = 2**30
 
 
 def surroundings() -> dict[str, str]:
-    """What the last bits of results may depend on, by name."""
+    """Facts by name on which the last bits of results may depend."""
     features: dict[str, bool] = getattr(_multiarray_umath, "__cpu_features__", {})
     return {
         "fmugym": version("fmugym-toolbox"),
@@ -144,14 +144,14 @@ class Recording:
 
 
 METADATA: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
-"""What a recording holds besides arrays."""
+"""Names of the facts of a recording besides arrays."""
 
 _ARRAYS: Final = {
     **dict.fromkeys(("actions", "observations"), ("biuf", None)),
     "rewards": ("f", 1),
     **dict.fromkeys(("terminated", "truncated"), ("b", 1)),
 }
-"""The kinds of numbers in each array, and how many dimensions it has; None for any."""
+"""Kinds of numbers and of dimensions of each array; None for any."""
 
 
 def _require_small(archive: zipfile.ZipFile) -> None:
@@ -163,7 +163,7 @@ def _require_small(archive: zipfile.ZipFile) -> None:
 
 
 def _facts(header: dict[str, Any]) -> dict[str, Any]:
-    """What a header says; raises whatever its damage leads to."""
+    """Read the facts of a header; damage raises any exception."""
     if header["version"] != _VERSION:
         raise ValueError("it is of another version of the format")
     stream, seed = tuple(map(int, header["stream"])), header["seed"]
@@ -248,7 +248,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 @dataclass(frozen=True)
 class ReplayReport:
-    """What a replay has shown.
+    """Result of a replay.
 
     Attributes:
         steps: How many steps were replayed.

@@ -1,4 +1,4 @@
-"""Actions from -1 to 1 that stand for the whole ranges of a task's actions."""
+"""Scaling of actions from -1 to 1 to the whole ranges of a task's actions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Temporary folders with their owner in the name, so that those of killed processes can go."""
+"""Temporary folders named after their process, so that those of killed processes can go."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _OTHER_ROOTS: Final = (
     if sys.platform == "win32"
     else ("/tmp", "/var/tmp", "/dev/shm")
 )
-"""Where all users may make folders."""
+"""Folders in which all users may make folders."""
 
 
 def folder_name() -> Path:
-    """A name for a temporary folder of this process, after a first look for those of dead ones.
+    """Name a temporary folder of this process, after a first look for folders of dead ones.
 
     There is no such folder yet. So the caller can see to its removal before it makes it, and no
     signal comes in between.

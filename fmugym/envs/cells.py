@@ -1,4 +1,4 @@
-"""Cells of the CloudPendulum lab as backends.
+"""Cells of the CloudPendulum lab, as backends.
 
 They use the methods of the published client only. So the client of the real lab fits as well as
 that of the simulated lab, and neither is imported here.
@@ -37,7 +37,7 @@ _METHODS: Final = (
     "set_torque",
     "set_impedance_controller_params",
 )
-"""The methods that every client has; those for leases are needed for leases only."""
+"""Methods of every client; methods about leases are needed for leases only."""
 
 _LEAVING = re.compile("(Position|Velocity) ?Limit ?Violation")
 """The lab's message that it has ended a session because the arm passed a limit."""

@@ -1,4 +1,4 @@
-"""Agents and simple controllers side by side: the same episodes, and what each makes of them."""
+"""Evaluation of players: all play the same episodes, with a score for each."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Wrap = Callable[[FMUEnv], Any]
 
 @dataclass(frozen=True)
 class Score:
-    """What a controller reached in some episodes.
+    """Result of a player in some episodes.
 
     Attributes:
         name: The controller.

@@ -1,4 +1,4 @@
-"""What ``fmugym simulate`` writes: tables, pictures, reports."""
+"""Output files of ``fmugym simulate``: tables, pictures, reports."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ def _require_ending(path: Path, endings: Sequence[str]) -> None:
 
 
 def title_of(target: str) -> str:
-    """What a task is called in pictures and reports: a file by its name, without its folder."""
+    """Title of a task in pictures and reports: a file's name without its folder."""
     path = Path(target)
     return path.name if path.is_file() else target
 
 
 @dataclass(frozen=True)
 class About:
-    """What a report tells of a task.
+    """Description of a task in a report.
 
     Attributes:
         facts: By name: the FMU, versions.
@@ -109,7 +109,7 @@ class EpisodeFiles:
 
     @contextmanager
     def finished(self, seed: int) -> Iterator[None]:
-        """Write all files at the end, however that comes, with what was recorded until then."""
+        """Write all files at the end, also after a failure, with the rows until then."""
         try:
             yield
         finally:

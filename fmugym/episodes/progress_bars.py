@@ -12,13 +12,13 @@ from typing import Final
 __all__ = ["Advance", "no_progress", "progress_bar", "quiet"]
 
 Advance = Callable[..., None]
-"""Is told how many steps were done since the last call, and perhaps a text to show beside."""
+"""Takes the number of steps since the last call, and perhaps a text to show beside."""
 
 
 _PARTS: Final = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 _FINE: Final = 1000
-"""So many parts of a bar are told apart where nothing is counted."""
+"""Resolution of a bar in which nothing is counted."""
 
 quiet: Final = ContextVar("quiet", default=False)
 """Whether to show results and errors only."""

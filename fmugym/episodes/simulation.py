@@ -1,4 +1,4 @@
-"""Episodes of a task, and who acts in them."""
+"""Players of episodes: agents, controllers and random actions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class Player:
-    """One who acts.
+    """Player of episodes: a policy, and the environment that it needs.
 
     Attributes:
         make_policy: Makes the policy for an environment.

@@ -1,4 +1,4 @@
-"""The derivatives of a system by the chain rule, from those of its components."""
+"""Chain rule: the derivatives of a system, from the derivatives of its components."""
 
 from __future__ import annotations
 

@@ -115,12 +115,12 @@ class FitResult:
         return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
 
     def distributions(self) -> dict[str, DrawnColumn]:
-        """Return the values as parameters of which each episode draws one of 1000 ``rows``."""
+        """Return the parameters as distributions; each episode draws one of 1000 ``rows``."""
         columns = zip(self.values, self.rows(1000).T.tolist(), strict=True)
         return {name: DrawnColumn(values, table="fit") for name, values in columns}
 
     def untold(self) -> list[dict[str, float]]:
-        """Name what the data do not tell: combinations of parameters that are hardly determined.
+        """Name combinations of parameters that the data hardly determine.
 
         Along such a direction the standard error is larger than that of a guess within the bounds.
 

@@ -51,7 +51,7 @@ DESCENTS = 3
 """Of the candidates, as many of the best ones are starts of an optimization."""
 
 REWEIGHTINGS = 2
-"""How often outputs are weighted anew, by the noise that the residuals show."""
+"""Number of times that outputs are weighted anew, by the noise of the residuals."""
 
 LEAST_NOISE = 1e-6
 """Of an output, as a part of its standard deviation."""
@@ -245,7 +245,7 @@ class Problem:
         )
 
     def uncertainty(self, solution: Any) -> dict[str, Any]:
-        """Say how sure the parameters are, by the attributes of ``FitResult``.
+        """Estimate the uncertainty of the parameters, as attributes of ``FitResult``.
 
         Residuals that are no white noise count as correlated (Newey and West).
         """
@@ -273,7 +273,7 @@ class Problem:
     def _correlated(
         self, solution: Any, correlations: Mapping[str, Correlation]
     ) -> tuple[FloatArray, int]:
-        """The covariance of J' r of residuals that depend on those before, and its freedom."""
+        """Covariance of J' r for correlated residuals, and its degrees of freedom."""
         products = solution.jac * solution.fun[:, np.newaxis]
         sums = products.reshape(-1, len(correlations), len(self.start)).sum(axis=1)
         lags = memory_of(max(one.first for one in correlations.values()), len(sums))
@@ -290,7 +290,7 @@ class Problem:
         return np.split(rows, np.cumsum([one.sum() for one in self._counted])[:-1])
 
     def _residuals(self, parameters: FloatArray) -> FloatArray:
-        """Return what SciPy minimizes: the residuals at the best initial states."""
+        """Residuals that SciPy minimizes, at the best initial states."""
         states, blocks = self._fit_states(parameters)
         self._last = parameters.copy(), states
         residuals = np.concatenate([block.residual for block in blocks])
@@ -416,7 +416,7 @@ def start_between(value: float, low: float, high: float) -> float:
 
 
 def _counted(trajectory: Trajectory, experiment: FitSettings) -> MaskArray:
-    """Which samples of a trajectory count: those after the wash-in."""
+    """Samples of a trajectory after the wash-in."""
     since, wash_in = trajectory.time - trajectory.time[0], experiment.wash_in
     begin = -1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0)
     counted = since > begin

@@ -1,4 +1,4 @@
-"""Information, covariances, and what residuals tell."""
+"""Statistics of residuals: information, covariances and correlation."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ RANK_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
 
 FALSE_ALARM = 1e-3
-"""How often white noise counts as correlated."""
+"""Share of white noise that counts as correlated."""
 
 ROUNDING = 1e-6
-"""Residuals below this, in units of their scale, are those of the arithmetic."""
+"""Residuals below this, in units of their scale, are rounding errors."""
 
 MOST_LAGS = 20
 """Of the autocorrelations that the test for white noise looks at."""
@@ -51,7 +51,7 @@ def sandwich(jacobian: FloatArray, scores: FloatArray) -> tuple[FloatArray, Floa
 
 
 class Correlation(NamedTuple):
-    """How the residuals of an output depend on those before.
+    """Correlation of the residuals of an output with earlier ones.
 
     Attributes:
         first: The correlation with the residual one sample before.
@@ -82,7 +82,7 @@ class Correlation(NamedTuple):
 
 
 def memory_of(correlation: float, count: int) -> int:
-    """Choose the lags for ``newey_west``: those for a process of first order.
+    """Choose the lags of ``newey_west`` for a process of first order.
 
     Andrews, "Heteroskedasticity and autocorrelation consistent covariance matrix estimation",
     Econometrica 59 (1991).

@@ -72,7 +72,7 @@ class Trajectory:
         return Trajectory(self.time[rows], outputs, inputs, self.label)
 
     def without_repeats(self) -> Trajectory:
-        """Drop stale samples, whose outputs all equal those of the sample before.
+        """Drop stale samples, whose outputs all equal the outputs of the sample before.
 
         More than five repeats in a row stay, because they show a plant at rest.
         """

@@ -1,4 +1,4 @@
-"""Derivatives by the states of an FMU: episodes that start a little beside a trajectory."""
+"""Derivatives by the states of an FMU, from episodes that start beside a trajectory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fmugym.vector.vector_env import FMUVectorEnv
 __all__ = ["Matrices", "differentiate_by_starts"]
 
 _AGREEMENT: Final = 1e-3
-"""By how much a step may differ after a start at the state before it, as a fraction of scales."""
+"""Tolerated difference of a step after a start at the state before it, as a part of scales."""
 
 _LEAST: Final = 1e-3
 """The least magnitude of a state, as a fraction of its nominal value: states at rest have rounding
@@ -129,7 +129,7 @@ class _Perturbation:
     def _play_at_any_time(
         self, trials: _Trials, x: FloatArray, scales: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Let the FMU start at the time of each step, or at that of the trajectory.
+        """Start the FMU at the time of each step, or at the time of the trajectory.
 
         The first is right for all FMUs that can start at any time. Others may not depend on it.
         """
@@ -273,7 +273,7 @@ class _Perturbation:
 
 
 def _slopes(before: FloatArray, after: FloatArray, widths: FloatArray) -> FloatArray:
-    """The differences of pairs of trials, divided by how far they are apart.
+    """Differences of pairs of trials, divided by their distances.
 
     Args:
         before: The states before the step, shape (horizon, 2 (n_x + n_u), n_x); the first n_x pairs

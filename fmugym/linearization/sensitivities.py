@@ -28,7 +28,7 @@ __all__ = [
 
 
 class Derivatives(NamedTuple):
-    """How a trajectory changes with its actions.
+    """Derivatives of a trajectory by its actions.
 
     The derivative by an action of a later step is 0.
 
@@ -136,7 +136,7 @@ def checked_trajectory(space: spaces.Box, actions: Any) -> npt.NDArray[Any]:
 
 
 def require_vector(envs: Any, name: str) -> None:
-    """Refuse what is no open vector environment.
+    """Require an open vector environment.
 
     Raises:
         ConfigError: If it is something else.
@@ -150,7 +150,7 @@ def require_vector(envs: Any, name: str) -> None:
 def moved_alone(
     space: spaces.Box, nominal: npt.NDArray[Any], step: float
 ) -> tuple[npt.NDArray[Any], FloatArray]:
-    """The nominal actions, then two candidates for each element; and how far these are apart."""
+    """Nominal actions, two candidates for each element, and the distances of these."""
     *moved, widths = moved_both_ways(space, nominal, step)
     candidates = np.repeat(nominal[None], 2 * nominal.size + 1, axis=0)
     flat = candidates.reshape(len(candidates), -1)
@@ -185,7 +185,7 @@ def moved_both_ways(
 
 
 def differences(values: npt.NDArray[Any], widths: FloatArray) -> FloatArray:
-    """The differences of each pair of candidates, divided by how far they are apart.
+    """Differences of each pair of candidates, divided by their distances.
 
     Args:
         values: What the candidates of ``moved_alone`` lead to, in their order.

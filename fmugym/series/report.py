@@ -210,7 +210,7 @@ def _means(found: Mapping[str, Sequence[EpisodeSummary]], figures: _Figures) -> 
 
 
 def _gains(run: Sequence[EpisodeSummary], first: Sequence[EpisodeSummary]) -> list[float]:
-    """Gain of each run in reward over the first run, over the same episodes."""
+    """Rewards of a run's episodes, less the rewards of the same ones of the first run."""
     rewards = {(one.environment, one.episode): one.reward for one in first if run is not first}
     pairs = [(one.reward, rewards.get((one.environment, one.episode))) for one in run]
     return [reward - other for reward, other in pairs if other is not None]

@@ -1,4 +1,4 @@
-"""Predictions: a surrogate beside the FMU, in episodes that its fit has not seen."""
+"""Predictions by a surrogate, compared with the FMU in episodes that the fit has not seen."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Prediction(NamedTuple):
 
 
 def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
-    """Let a surrogate predict episodes from the FMU's inputs and from where they begin.
+    """Predict episodes by a surrogate, from the FMU's inputs and first outputs.
 
     Args:
         surrogate: The surrogate.

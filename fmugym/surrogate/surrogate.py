@@ -25,7 +25,7 @@ __all__ = ["Surrogate"]
 
 @dataclass(frozen=True)
 class Surrogate:
-    """What an FMU does in a step, fitted to its courses.
+    """Model of a step of an FMU, fitted to its courses.
 
     Given as the ``backend`` of environments, it steps in the place of the FMU.
 
@@ -85,7 +85,7 @@ class Surrogate:
         return found
 
     def runs(self, rows: FloatArray, after: FloatArray) -> Callable[[], None]:
-        """A function that reads what a step depends on, and writes the outputs after it.
+        """Make a function from regressors of a step to the outputs after it.
 
         Args:
             rows: Shape (d, N).
@@ -112,7 +112,7 @@ class Surrogate:
         return run
 
     def next_outputs(self, row: Sequence[Value]) -> list[Value]:
-        """The outputs after the step, from what it depends on."""
+        """Outputs after the step, from its regressors."""
         factors = self.terms.factors(row)
         return [
             self._next(place, row[place], factors, weights)

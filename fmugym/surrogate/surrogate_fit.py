@@ -59,7 +59,7 @@ def fit(courses: Courses) -> Surrogate:
 
 
 class _Data:
-    """The courses, and which of them each fold leaves out."""
+    """Courses of a fit, and the courses that each fold leaves out."""
 
     def __init__(self, courses: Courses) -> None:
         spec = courses.spec
@@ -82,7 +82,7 @@ class _Data:
         self.horizon = max(1, min(_HORIZON, max(one.steps for one in self.all) // 4))
 
     def bounds(self, form: SurrogateForm) -> tuple[FloatArray, FloatArray]:
-        """Between what outputs stay: near their ranges, or exactly where these limit them."""
+        """Bounds of outputs: a little beyond their ranges; limited outputs stay within theirs."""
         low, high = self.ends
         beyond = _BEYOND * (high - low)
         beyond[[*form.limited]], beyond[[*form.angles]] = 0.0, np.inf
@@ -148,7 +148,7 @@ class _Data:
         return simulation_errors(terms, weights, left, self.horizon, self)
 
     def _split(self, number: int) -> tuple[list[Course], list[Course]]:
-        """The courses of a fit, and those that it does not see."""
+        """Courses of a fit, and courses for its test."""
         long = [one for one in self.all if one.steps >= self.horizon] or self.all
         pieces = self.all if len(long) >= 2 * _FOLDS else list(_pieces(self.all, 2 * self.horizon))
         left = [one for place, one in enumerate(pieces) if place % _FOLDS == number]
@@ -186,7 +186,7 @@ class _Data:
 
 
 def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:
-    """What terms leave of the changes, shape (n, k)."""
+    """Residuals of the changes, shape (n, k)."""
     both = np.concatenate([values, more])
     square = both @ both.T + 1e-6 * both.shape[1] * np.eye(len(both))
     weights = np.linalg.solve(square, both @ changes)

@@ -80,7 +80,7 @@ class SurrogatePool(CountedPool):
         return self.outputs, self.statuses
 
     def _places_in(self, variables: tuple[Variable, ...]) -> list[int]:
-        """The places among variables of those that were set in the courses.
+        """Places of the variables that were set in the courses.
 
         Raises:
             SimulationError: If others are set, too: nobody knows what they change.
@@ -122,7 +122,7 @@ class SurrogatePool(CountedPool):
         self._is_first &= ~wanted
 
     def _keep(self, wanted: MaskArray) -> None:
-        """Let the outputs be those after the step."""
+        """Take the outputs after the step."""
         rows, count, end = self._rows, self._outputs, self._first_input
         if self._lags:
             older = rows[count : end - count].copy()

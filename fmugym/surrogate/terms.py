@@ -1,4 +1,4 @@
-"""The forms of surrogates: of what the change of outputs in a step is a sum."""
+"""Terms of surrogates, whose weighted sum is the change of the outputs in a step."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _BEYOND: Final = 0.2
 """Numbers are clipped to their range in the courses, which is so much wider on both sides."""
 
 _STEEPNESS: Final = 1.5
-"""The root mean square of what is in a tanh."""
+"""Root mean square of the argument of a tanh."""
 
 Number = Callable[[float], Any]
 
 
 @dataclass(frozen=True)
 class SurrogateForm:
-    """What the change of an output depends on.
+    """Form of a surrogate: the regressors and terms of the changes of outputs.
 
     Attributes:
         lags: How many earlier outputs and inputs it depends on, beside the present ones.
@@ -61,7 +61,7 @@ class SurrogateForm:
 
 
 def regressors_of(form: SurrogateForm, course: Course) -> FloatArray:
-    """What the steps of a course depend on, shape (d, T).
+    """Regressors of the steps of a course, shape (d, T).
 
     These are the outputs, their changes in earlier steps, the inputs, their changes, and the
     values set before initialization. Before an episode, nothing has changed.
@@ -130,16 +130,16 @@ class Terms:
 
     @property
     def count(self) -> int:
-        """How many terms there are."""
+        """Number of terms."""
         return 1 + self.factor_count + int(self.pairs.shape[1])
 
     @property
     def factor_count(self) -> int:
-        """How many factors there are."""
+        """Number of factors."""
         return int(self.mixing.shape[1]) - 1 + len(self.mixing) + len(self.form.thresholds)
 
     def _scaled(self, row: Sequence[Any], number: Number = float) -> list[Value]:
-        """The factors that are scaled numbers; what is constant in the courses is none."""
+        """Factors that are scaled numbers, without numbers that are constant in the courses."""
         outputs = self.widths[0]
         found: list[Value] = []
         for place, value in enumerate(row):
@@ -152,7 +152,7 @@ class Terms:
         return found
 
     def factors(self, row: Sequence[Value], number: Number = float) -> list[Value]:
-        """All factors, of what a step depends on.
+        """All factors of the regressors of a step.
 
         Args:
             row: Its values.

@@ -1,4 +1,4 @@
-"""How exact an FMU is with other settings: an episode, repeated with the same inputs.
+"""Accuracy of an FMU under other settings: an episode, repeated with the same inputs.
 
 The inputs of an episode are kept. The FMU alone repeats them, with other communication steps or
 solvers. What changes is an error of these settings.
@@ -28,7 +28,7 @@ from fmugym.task.pool_opening import PoolOpening
 __all__ = ["TOLERANCE", "OutputTrajectory", "Replay", "error_of", "substeps_of"]
 
 TOLERANCE: Final = 0.01
-"""The error up to which settings are exact enough, as a fraction of how much outputs vary."""
+"""Tolerated error of settings, as a part of the variation of outputs."""
 
 _CONVERGED: Final = 0.2 * TOLERANCE
 _STEPS: Final = 50
@@ -44,12 +44,12 @@ _NOTHING: Final = 1e-9
 
 
 _silent: Final = logging.Logger("fmugym.validate.settings", logging.CRITICAL + 1)
-"""Drops what the FMU says: it may fail with settings that are not those of the task."""
+"""Drops messages of the FMU, which may fail with settings other than the task's."""
 
 
 @dataclass(frozen=True)
 class OutputTrajectory:
-    """What an FMU gave.
+    """Outputs of an FMU in an episode.
 
     Attributes:
         outputs: Its real outputs at the start and after each step, shape (T + 1, k); NaN after a
@@ -81,7 +81,7 @@ class Replay:
 
     @classmethod
     def of(cls, env: FMUEnv) -> Replay:
-        """Play the beginning of an episode with random actions, and keep what the FMU got."""
+        """Play the beginning of an episode with random actions, and keep the FMU's inputs."""
         env.action_space.seed(0)
         env.reset(seed=0)
         draws, pool = env.inside.draws, env.inside.pool
@@ -146,7 +146,7 @@ class Replay:
 
 
 def _untried(fmu: FMU) -> FMU:
-    """The FMU without trials: each setting would have one of its own.
+    """An FMU without trials, since each setting would have a trial of its own.
 
     So an FMU that is not bundled runs in a worker process, whose end is a failure of the setting.
     """
@@ -158,7 +158,7 @@ def _untried(fmu: FMU) -> FMU:
 def error_of(
     course: OutputTrajectory | None, reference: OutputTrajectory, steps: int | None = None
 ) -> float:
-    """The difference of two courses, as a fraction of how much the outputs vary.
+    """Difference of two trajectories, as a part of the variation of the outputs.
 
     It is the root of the mean square over the steps, of the worst output. It is infinite for a
     course with a failure.
@@ -178,7 +178,7 @@ def error_of(
 
 
 def _variation(rows: FloatArray) -> FloatArray:
-    """How much each output varies, beyond its rounding."""
+    """Variation of each output, beyond its rounding."""
     varies: FloatArray = _root_mean_square(rows - rows[0])
     return np.where(varies > _NOTHING * np.abs(rows).max(axis=0), varies, 0.0)
 
@@ -191,7 +191,7 @@ def _root_mean_square(rows: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Substeps:
-    """What other numbers of substeps give.
+    """Results of other numbers of substeps.
 
     Attributes:
         needed: The least number that is exact enough; None if the results do not settle.
@@ -209,7 +209,7 @@ class Substeps:
 
 
 def substeps_of(replay: Replay) -> Substeps | None:
-    """Find out how many substeps are needed.
+    """Find the necessary number of substeps.
 
     The number is doubled until the results settle.
 
@@ -234,7 +234,7 @@ def substeps_of(replay: Replay) -> Substeps | None:
 
 
 def _difference(courses: dict[int, OutputTrajectory | None], finest: int, steps: int) -> float:
-    """That of the finest repetition and the one before."""
+    """Difference of the finest repetition and the one before."""
     reference = courses[finest]
     before = max((n for n in courses if n < finest), default=finest)
     return np.inf if reference is None else error_of(courses[before], reference, steps)

@@ -1,4 +1,4 @@
-"""Settings that suit a task: what to write into its file, and why."""
+"""Recommended settings of a task, with reasons."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _off(error: float) -> str:
 
 
 def _cost(seconds: float, before: float | None) -> str:
-    """What a change costs, in words; nothing if that is not known."""
+    """Describe the cost of a change; "" if it is not known."""
     return "" if before is None else f"; a step takes {seconds / before:.2g} times as long"
 
 
@@ -134,7 +134,7 @@ def _of_solvers(replay: Replay) -> Iterator[Advice | CheckResult]:
 def _each_solver(
     replay: Replay, reference: OutputTrajectory
 ) -> Iterator[tuple[tuple[str, float], OutputTrajectory]]:
-    """The settings that are exact enough, by solver and tolerance; those of the least cost."""
+    """Exact settings of the least cost, by solver and tolerance."""
     for name in _SOLVERS:
         for tolerance in _TOLERANCES:
             course = replay.run(solver=name, tolerance=tolerance, max_step=None)
@@ -159,7 +159,7 @@ def _solver(replay: Replay, best: tuple[str, float], why: str) -> Iterator[Advic
 
 
 def _time_step(replay: Replay) -> Advice | None:
-    """A time step that suits the eigenvalues of the FMU where it starts."""
+    """Recommend a time step from the eigenvalues at the start of the FMU."""
     eigenvalues = _eigenvalues(replay)
     if eigenvalues is None or not len(eigenvalues):
         return None
@@ -171,7 +171,7 @@ def _time_step(replay: Replay) -> Advice | None:
 
 
 def _eigenvalues(replay: Replay) -> ComplexArray | None:
-    """Those of the linear model at the start; None if the FMU gives none."""
+    """Eigenvalues of the linear model at the start; None if the FMU gives none."""
     names = [variable.name for variable in replay.variables]
     starts = dict(zip(names, replay.starts[:, 0].tolist(), strict=True))
     verdict = known_verdict(replay.opening.fmu)
@@ -187,7 +187,7 @@ def _eigenvalues(replay: Replay) -> ComplexArray | None:
 
 
 def _longest(eigenvalues: ComplexArray) -> Iterator[tuple[float, str]]:
-    """Limits of the time step, and what gives them."""
+    """Limits of the time step, and the reason for each."""
     rates, waves = np.abs(eigenvalues.real), np.abs(eigenvalues.imag)
     swings = waves[waves > rates]
     if len(swings):

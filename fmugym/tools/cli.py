@@ -1,4 +1,4 @@
-"""The command line: from a first look at an FMU to episodes of a task.
+"""Command line of fmugym: its parser, and the run of a command.
 
 ::
 
@@ -157,7 +157,7 @@ def _end_before(error: BaseException) -> KeyboardInterrupt | None:
 
 
 def _told(error: Exception) -> str:
-    """An error as a text; those of the system without their numbers."""
+    """Describe an error; errors of the system come without their numbers."""
     if not isinstance(error, OSError):
         return str(error)
     if error.filename is None:
@@ -203,7 +203,7 @@ def _reader(kind: type[int] | type[float], what: str) -> Callable[[str], float]:
 
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
+    """Parse arguments; those of ``train`` may stand anywhere, which argparse does not know."""
     parser, commands = _parser()
     argcomplete.autocomplete(parser)
     given = sys.argv[1:] if argv is None else argv
@@ -221,7 +221,7 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> tuple[_Parser, dict[str, _Parser]]:
-    """Make the parser; return it with those of the commands."""
+    """Make the parser; returns it with the parsers of the commands."""
     parser = _Parser("fmugym", description="Look at an FMU, make a task of it, and run that.")
     parser.add_argument("--version", action="version", version=version("fmugym-toolbox"))
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")

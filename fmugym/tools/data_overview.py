@@ -1,4 +1,4 @@
-"""Overview of the data of a task: how their files were read."""
+"""Overview of a task's data, as read from the files."""
 
 from __future__ import annotations
 

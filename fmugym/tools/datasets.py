@@ -1,4 +1,4 @@
-"""Datasets of Minari, which ``simulate`` makes and ``info`` reads."""
+"""Datasets of Minari, made by ``simulate`` and read by ``info``."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def make_dataset(arguments: argparse.Namespace) -> None:
 
 
 def show_dataset(arguments: argparse.Namespace, name: str) -> None:
-    """Say what is in a dataset, and write its recordings to a folder if one is given."""
+    """Describe a dataset, and write its recordings to a folder if one is given."""
     recordings = imported("fmugym.minari", "minari").read_dataset(name)
     what, folder = f"dataset {name}", arguments.output
     if folder is not None:
@@ -126,7 +126,7 @@ def show_dataset(arguments: argparse.Namespace, name: str) -> None:
 def _logged(
     arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]
 ) -> tuple[list[Recording], Callable[..., FMUEnv]]:
-    """The episodes of logs, and what makes an environment of their time."""
+    """Read the episodes of logs, and make an environment for their time."""
     columns = dict(map(renaming, arguments.column or []))
     tolerance = 1e-3 if arguments.tolerance is None else arguments.tolerance
     found, make = list[Recording](), make_env

@@ -1,4 +1,4 @@
-"""The command that exports agents: export."""
+"""Command ``export``: agents as C, FMUs and ONNX."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ __all__ = ["add_export"]
 
 _ENDINGS: Final = (".c", ".fmu", ".onnx")
 _STEPS: Final = 2000
-"""Those of an FMU to which a surrogate is fitted."""
+"""Steps of an FMU to which a surrogate is fitted."""
 
 _UNSEEN: Final = 4
 """Episodes in which the picture of a surrogate compares it with the FMU."""

@@ -1,4 +1,4 @@
-"""What ``validate`` reports: findings, costs and recommended settings."""
+"""Results of ``validate``: checks, costs and recommended settings."""
 
 from __future__ import annotations
 

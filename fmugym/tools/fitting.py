@@ -1,4 +1,4 @@
-"""The command that finds parameters of an FMU in logs of a plant: fit."""
+"""Command ``fit``: parameters of an FMU from logs of a plant."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ def _table(fit: FitResult) -> list[str]:
 
 
 def _warnings(fit: FitResult, has_shift: bool) -> list[str]:
-    """What a reader of the table must know."""
+    """Warnings for a reader of the table."""
     found = []
     for name, one in fit.correlations.items():
         if not one.is_noise and not has_shift:

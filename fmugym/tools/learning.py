@@ -1,4 +1,4 @@
-"""The command that trains: train."""
+"""Command ``train``."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _DEFAULTS: Final[dict[str, Any]] = {
     "episodes": 5,
     "normalize": True,
 }
-"""What holds if neither the options nor a training that is resumed say otherwise."""
+"""Defaults of options that neither the user nor a resumed training gives."""
 
 
 def add_train(commands: Commands) -> None:
@@ -142,7 +142,7 @@ _OF_ALGORITHMS: Final = (
 )
 _OF_SEARCHES: Final = ("minutes", "rounds")
 _SCALE: Final = 0.3
-"""Of the range of actions: what a residual policy adds at most."""
+"""Largest correction by a residual policy, as a part of the range of actions."""
 _OTHERWISE: Final = {"arguments": "KEY=VALUE", "normalize": "--no-normalize"}
 _COUNTS: Final = ("rounds", "steps", "envs", "episodes")
 
@@ -210,7 +210,7 @@ def _search(arguments: argparse.Namespace) -> None:
 
 
 def _tell_faults(parts: Mapping[str, float]) -> None:
-    """Tell what may have decided beside the rewards."""
+    """Report faults, which may have decided beside the rewards."""
     if any(parts.values()):
         listing = ", ".join(f"{name} {100 * part:.3g} %" for name, part in parts.items())
         tell(f"episodes that a fault has cut short, which count before the reward: {listing}")
@@ -246,7 +246,7 @@ def _tell_what_is_kept(folder: Path, state: str) -> None:
 
 
 def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
-    """The settings that the options make, together with what a training was begun with."""
+    """Settings of a training, from the options and from the training that is resumed."""
     before = facts_of(arguments.output) if arguments.resume else {}
     for name, default in _DEFAULTS.items():
         if getattr(arguments, name) is None:
@@ -277,7 +277,7 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
 def _residual_of(
     arguments: argparse.Namespace, make_env: Callable[..., FMUEnv], before: Any
 ) -> Any:
-    """What the options say of a controller; without any, what the training was begun with."""
+    """Residual policy of the options, or else of the training that is resumed."""
     if arguments.residual is None:
         if arguments.residual_scale is not None:
             raise ConfigError("name the controller, too: --residual NAME")
@@ -287,7 +287,7 @@ def _residual_of(
 
 
 def _records_of(arguments: argparse.Namespace, before: Any) -> TrainingRecords | None:
-    """What the options say to record; without any, what the training was begun with."""
+    """Records of the options, or else of the training that is resumed."""
     own = (arguments.record_env, arguments.record_every, arguments.record_format)
     if arguments.record is None:
         if any(one is not None for one in own):

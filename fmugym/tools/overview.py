@@ -1,4 +1,4 @@
-"""The facts about an FMU that a user asks for first, as plain data and as text.
+"""Overview of an FMU: its main facts, as plain data and as text.
 
 They come from the archive and the XML. Nothing of the FMU is executed.
 """
@@ -78,7 +78,7 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
 
 
 def _trial(fmu: FMU) -> dict[str, Any] | None:
-    """What the first meeting has shown on this machine; None if there was none yet."""
+    """Results of the trial on this machine; None if there was none yet."""
     verdict = known_verdict(fmu)
     if verdict is None:
         return None
@@ -142,7 +142,7 @@ def finite_or_none(number: float) -> float | None:
 
 
 def typed_start(variable: Variable) -> bool | int | float | str | None:
-    """Convert the start value, which the XML has as text, to the variable's type.
+    """Convert a start value from its text in the XML to the type of the variable.
 
     Returns:
         The value; the text itself for strings, arrays and what is not finite or malformed.
@@ -173,7 +173,7 @@ def as_text(facts: Mapping[str, Any]) -> str:
 
 
 def tables(facts: Mapping[str, Any]) -> Iterator[str]:
-    """The part of an overview below the heading: the trial, findings, variables, those not listed.
+    """Body of an overview: the trial, findings, variables, and the number of the others.
 
     Args:
         facts: What ``overview`` returned.
@@ -182,7 +182,7 @@ def tables(facts: Mapping[str, Any]) -> Iterator[str]:
 
 
 def headed(facts: Mapping[str, Any], kind: str, rows: Mapping[str, str]) -> Iterator[str]:
-    """The heading of an overview: what it is about, and some facts by name."""
+    """Heading of an overview: its subject, and some facts by name."""
     yield plain(f"{facts['model_name']} ({kind})")
     if facts["description"]:
         yield plain(facts["description"])

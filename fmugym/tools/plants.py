@@ -1,4 +1,4 @@
-"""The commands about plants: serve, and simulate --plant."""
+"""Commands about plants: ``serve``, and ``simulate --plant``."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def plant_task(arguments: argparse.Namespace) -> Task:
 
 
 def follow_plant(arguments: argparse.Namespace) -> None:
-    """Let one who acts be the shadow of a plant, until so many steps are done."""
+    """Let a player be the shadow of a plant for so many steps."""
     if arguments.scenario is not None or arguments.episodes != 1:
         raise ConfigError("a plant has no --scenario and no --episodes: say --steps")
     player = only_player(arguments)
@@ -107,7 +107,7 @@ def _show(arguments: argparse.Namespace, done: Sequence[Summary], errors: Sequen
 
 
 def _table(errors: Sequence[Error]) -> list[str]:
-    """The errors of predictions, by variable, at each doubling of how far they go."""
+    """Errors of predictions by variable, at horizons that double."""
     lines = []
     for name in dict.fromkeys(one.name for one in errors):
         own = [one for one in errors if one.name == name]

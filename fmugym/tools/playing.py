@@ -1,4 +1,4 @@
-"""The commands that play episodes: simulate, evaluate, bench."""
+"""Commands that play episodes: ``simulate``, ``evaluate``, ``bench``."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _play(
     player: Player,
     runs: dict[str, list[Summary]],
 ) -> None:
-    """Play the episodes of one who acts."""
+    """Play the episodes of a player."""
     label = f"{name}: " if len(runs) > 1 else ""
     with (
         closing(player.make_env(_maker(arguments))) as env,
@@ -139,7 +139,7 @@ def _play(
 
 
 def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
-    """How many steps the episodes take at most; None if only ``--steps`` limits them."""
+    """Most steps of the episodes; None if only ``--steps`` limits them."""
     limit = most_steps_of(env)
     return None if limit is None else min(limit, arguments.steps) * int(arguments.episodes)
 
@@ -206,7 +206,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 class LeftOut:
-    """Those who cannot play to the end, and are left out. The others play all the same.
+    """Players that failed and are left out, while the others play on.
 
     Args:
         players: All who shall play, by name.
@@ -227,7 +227,7 @@ class LeftOut:
 
     @contextmanager
     def noting(self, name: str) -> Iterator[None]:
-        """Leave one out who fails in a block."""
+        """Leave out a player if a block fails."""
         try:
             yield
         except Exception as error:
@@ -235,11 +235,11 @@ class LeftOut:
 
     @property
     def _asked(self) -> list[str]:
-        """Those who were asked for; random actions always play."""
+        """Players that the user asked for; random actions always play."""
         return [name for name in self._names if name != "random"] or self._names
 
     def require_some(self) -> None:
-        """Raise the first error if none is left of those who were asked for."""
+        """Raise the first error if no player is left that the user asked for."""
         if all(name in self.errors for name in self._asked):
             raise self.errors[self._asked[0]]
 

@@ -1,4 +1,4 @@
-"""A first version of an environment for an FMU, written from its model description.
+"""Skeleton of an environment class for an FMU, made from its model description.
 
 The names and texts come from a foreign file. They enter the program only as literals and in
 comments of one line, so that none of them can become code.
@@ -40,16 +40,16 @@ MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
 
 DEFAULT_STEP: Final = 0.01
-"""The step size in seconds where the FMU tells nothing about its time."""
+"""Step size in seconds for an FMU without a default experiment."""
 
 _MOST_ELEMENTS: Final = 100
 """Larger arrays are left out."""
 
 MOST_LOCALS: Final = 8
-"""Locals that replace outputs where the FMU has none."""
+"""Most locals that stand for the outputs of an FMU without any."""
 
 _EPISODE_STEPS: Final = 500
-"""About as many steps has the default experiment where the FMU gives no usable step size."""
+"""Approximate number of steps in a default experiment without a usable step size."""
 
 _MOST_STEPS: Final = 100_000
 """More steps than this are no episode."""
@@ -127,7 +127,7 @@ _HOOKS_WITHOUT_INPUT: Final = '''
 
 
 class Skeleton:
-    """The Python file for one FMU, with notes on what in it is a guess.
+    """Python file for an FMU, with notes on its guesses.
 
     Args:
         fmu: The FMU; nothing of it is executed.
@@ -166,7 +166,7 @@ class Skeleton:
 
     @property
     def left_out(self) -> int:
-        """How many parameters of the FMU are not among ``parameters``."""
+        """Number of parameters of the FMU that are not among ``parameters``."""
         return len(self._of("parameter")) - len(self.parameters)
 
     def _of(self, causality: str) -> list[Variable]:
@@ -187,7 +187,7 @@ class Skeleton:
         return ("Model" if not name or name[0].isdigit() else "") + name + "Env"
 
     def notes(self) -> Iterator[str]:
-        """What the user has to decide before the file is useful."""
+        """Decisions for the user, before the file is useful."""
         for variable in filter(needs_bounds, self.inputs):
             yield f"the FMU gives no limits of input {variable.name!r}; set them in 'bounds'"
         if not self.inputs:
@@ -281,7 +281,7 @@ class Skeleton:
 
     @property
     def stop_time(self) -> float | None:
-        """Where the FMU's default experiment ends; None where it gives no end, or one too early.
+        """End of the FMU's default experiment; None for none, or one too early.
 
         Some FMUs do not start without one.
         """
@@ -366,7 +366,7 @@ def _start(variable: Variable) -> float:
 
 
 def _reach(variable: Variable) -> tuple[float, float]:
-    """How far below and above its start value an input without limits may move.
+    """Distances below and above its start value that an input without limits may move.
 
     A tenth of a start value, and at most the nominal value. Without both, nothing is known; a model
     then fails more often with negative values than with positive ones.
@@ -422,7 +422,7 @@ def _array_start(variable: Variable) -> Any:
 
 
 def _quoted(text: str) -> str:
-    """A literal in ASCII, in double quotes where they need no escape."""
+    """Quote a text as a literal in ASCII, in double quotes if they need no escape."""
     literal = ascii(text)
     return literal if '"' in literal else f'"{literal[1:-1]}"'
 

@@ -1,4 +1,4 @@
-"""How fast a task is: steps per second of one environment and of many, and the FMU's share."""
+"""Speed of a task: steps per second of one environment and of many, and the FMU's share."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fmugym.vector import FMUVectorEnv
 __all__ = ["Speed", "SpeedReport", "bench", "speed_table"]
 
 _ROUNDS: Final = 5
-"""A measurement is the fastest of so many: what else the machine does only makes it slower."""
+"""Number of measurements, the fastest of which counts: other load only makes them slower."""
 
 _CAUTION: Final = (
     "Measured on this machine as it is now. Close other programs, measure several times, and "
@@ -138,7 +138,7 @@ def _fastest(step: Callable[[int], Any], seconds: float) -> float:
 
 
 def _count(step: Callable[[int], Any], seconds: float) -> int:
-    """About how many calls take so long."""
+    """Estimated number of calls in a time."""
     count = 1
     while True:
         begin = perf_counter()

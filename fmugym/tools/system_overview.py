@@ -1,4 +1,4 @@
-"""The facts about a system that a user asks for first, as plain data and as text."""
+"""Overview of a system: its main facts, as plain data and as text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"
 
 
 def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
-    """Find what a file is or names: an FMU, an SSP archive, or a task file with one of both.
+    """Find the model of a path: an FMU, an SSP archive, or a task file with one of both.
 
     Args:
         path: The file.
@@ -164,7 +164,7 @@ def _link(link: Mapping[str, Any]) -> str:
 
 
 def _change(gain: float, offset: float) -> str:
-    """What happens to a value on its way."""
+    """Describe the conversion of a value on its way."""
     parts = [f"* {gain:.6g}"] if gain != 1 else []
     if offset:
         parts.append(f"{'+' if offset > 0 else '-'} {abs(offset):.6g}")

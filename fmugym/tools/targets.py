@@ -1,4 +1,4 @@
-"""What the command line can run: task files, ids, classes and FMUs."""
+"""Targets of the command line: task files, ids, classes and FMUs."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def maker_of(
     *,
     takes_fmu: bool = False,
 ) -> Callable[..., FMUEnv]:
-    """Find what a text names.
+    """Find the maker of the environment that a text names.
 
     Args:
         target: The path of a task file, a registered id, or ``"module:Class"``.
@@ -76,7 +76,7 @@ def maker_of(
 def player_maker(
     target: str, scenario: str | None = None, master: str | None = None
 ) -> Callable[..., FMUEnv]:
-    """Find what a text names, for commands that play episodes; see ``maker_of``.
+    """Find the maker for commands that play episodes; see ``maker_of``.
 
     The function refuses a task whose outputs contradict their limits; see ``require_units``.
     """
@@ -93,7 +93,7 @@ def player_maker(
 
 
 def _nearest(target: str) -> str:
-    """The file or id that was probably meant, in words."""
+    """Name the file or id that the user probably meant."""
     folder = Path(target).parent
     files = [str(path) for kind in ("*.toml", "*.fmu") for path in folder.glob(kind)]
     ids = [name for name in gymnasium.registry if name.startswith("fmugym/")]

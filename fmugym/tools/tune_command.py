@@ -1,4 +1,4 @@
-"""The command that finds the numbers of a controller: tune."""
+"""Command ``tune``: numbers of a controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is wrong with a task: checks of an environment, with cures.
+"""Validation of a task: checks of an environment, with cures.
 
 Unlike ``fmugym.testing``, which checks that a class keeps the contract of environments, these
 checks look for tasks that run but cannot be learned.
@@ -55,7 +55,7 @@ _SECONDS: Final = 5.0
 _STEPS_BEFORE_RESTORE: Final = 10
 
 _ENVS: Final = ((100e-6, 64), (1e-3, 16))
-"""How many environments share the effort of a call: by the seconds that a step takes at most."""
+"""Numbers of environments that share the effort of a call, by the largest seconds of a step."""
 
 _FEWEST_ENVS: Final = 8
 
@@ -70,12 +70,12 @@ _EXPLORED: Final = (0.1, 10.0)
 """Between these sizes are actions that they find by steps of about 1."""
 
 _UNEVEN: Final = "of very different sizes"
-"""How the finding about such observations begins, for which ``normalize`` is recommended."""
+"""Beginning of the finding for which ``normalize`` is recommended."""
 
 
 @dataclass(frozen=True)
 class _Episode:
-    """What an episode of a check gave; arrays have one row for each step, the reset first.
+    """Results of an episode of a check; arrays have one row for each step, the reset first.
 
     Attributes:
         observations: Shape (n + 1, k).
@@ -127,7 +127,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> ValidationReport:
 
 
 def _repeated(replay: Replay, steps: int | None) -> tuple[list[CheckResult], list[Advice]]:
-    """What repetitions of an episode tell."""
+    """Check of repeated episodes."""
     found = list(advise(replay))
     findings = [one for one in found if isinstance(one, CheckResult)]
     advices = [one for one in found if isinstance(one, Advice)]
@@ -141,7 +141,7 @@ def _repeated(replay: Replay, steps: int | None) -> tuple[list[CheckResult], lis
 
 
 def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advice]:
-    """Lines for what other checks have found."""
+    """Advice that follows from other checks."""
     if recommended.get("normalize") and _has_limits(env.observation_space):
         yield Advice("agent", "normalize", True, f"observations are {_UNEVEN}")
     space: Any = env.action_space
@@ -177,7 +177,7 @@ def _restore_time(env: FMUEnv) -> float | None:
 def _recommended(
     env: FMUEnv, step_time: float, hooks: str, findings: Sequence[CheckResult]
 ) -> dict[str, Any]:
-    """Settings that suit what was measured."""
+    """Settings that suit the measurements."""
     settings: dict[str, Any] = {"reset_method": env.reset_method}
     if hooks != "none":
         settings["envs"] = next((n for most, n in _ENVS if step_time < most), _FEWEST_ENVS)
@@ -343,7 +343,7 @@ def _of_parameters(env: FMUEnv) -> Iterator[CheckResult]:
 
 
 def _numbers_of(env: FMUEnv, name: str) -> dict[str, Any]:
-    """What a parameter is, by scalars; nothing for Strings and structural parameters."""
+    """Numbers of a parameter by scalar; none for Strings and structural parameters."""
     known = env.inside.interface.parameters
     scalars = env.fmu.description.scalars(name)
     return {v.name: known[v.name] for v in scalars if v.name in known}
@@ -425,7 +425,7 @@ def _of_reward(first: _Episode, others: Sequence[_Episode]) -> CheckResult:
 
 
 def _factor_of(rewards: FloatArray) -> float:
-    """What makes tiny rewards, or tiny differences, as large as 1; 0 if there are none."""
+    """Rounded factor that brings tiny rewards or differences near 1; 0 if none are tiny."""
     size, spread = np.abs(rewards).max(), np.ptp(rewards)
     tiny = size if size < _TINY else spread
     return rounded_down(1 / tiny) if 0.0 < tiny < _TINY * max(1.0, size) else 0.0
@@ -441,7 +441,7 @@ def _advice_of_reward(env: FMUEnv, rewards: FloatArray) -> Iterator[Advice]:
 
 
 def _document(env: FMUEnv) -> Mapping[str, Any]:
-    """What the task of an environment declares; nothing for a class without one."""
+    """Declarations of an environment's task; an empty dict for a class without a task."""
     task = getattr(env, "task", None)
     return task.document if isinstance(task, Task) else {}
 
@@ -464,7 +464,7 @@ def _misread(env: FMUEnv) -> list[Misreading]:
 
 
 def _of_units(misread: Sequence[Misreading]) -> Iterator[CheckResult]:
-    """Tell what the FMU seems to mean by numbers to which it gives no unit."""
+    """Report likely units of numbers to which the FMU gives no unit."""
     for one in misread:
         verdict = "warning" if one.is_converted else "ok"
         verdict = "error" if one.contradicts else verdict
@@ -488,14 +488,14 @@ def _of_observations(
 
 
 def _is_normalized(env: FMUEnv) -> bool:
-    """Whether a task maps what the agent observes from its limits to -1 to 1."""
+    """Whether a task maps observations from their limits to the range from -1 to 1."""
     return _document(env).get("agent", {}).get("normalize") in (True, "limits")
 
 
 def _of_limits(
     env: FMUEnv, space: spaces.Box, names: tuple[str, ...], seen: Any, misread: Set[str]
 ) -> Iterator[CheckResult]:
-    """Tell observations beyond their limits, but for those in another unit or with errors."""
+    """Report observations beyond their limits, except those in another unit or with errors."""
     outside = ((seen < space.low.reshape(-1)) | (seen > space.high.reshape(-1))).any(axis=0)
     outside &= [name not in misread for name in names]
     if outside.any():
@@ -551,7 +551,7 @@ def _of_still(env: FMUEnv, names: tuple[str, ...], seen: Any) -> Iterator[CheckR
 
 
 def _own_name(env: FMUEnv, name: str) -> str:
-    """What the FMU calls a variable that has a name in the task."""
+    """Name in the FMU of a variable that has another name in the task."""
     return str(_document(env).get("variables", {}).get(name, {}).get("name", name))
 
 
@@ -596,7 +596,7 @@ def _of_controllers(env: FMUEnv) -> Iterator[CheckResult]:
 
 
 def _tried(env: FMUEnv, task: Task, texts: Mapping[str, Any]) -> tuple[list[CheckResult], set[str]]:
-    """What is wrong with controllers, and which actions they move.
+    """Check controllers: their mistakes, and the actions that they move.
 
     Those that stand in tables, or act in the warm-up, need not fit all actions.
     """
@@ -623,7 +623,7 @@ def _parts(task: Task) -> set[Any]:
 
 
 def _bound(env: FMUEnv, given: Any) -> Controller | None:
-    """A controller that has found what it needs; None for a constant action.
+    """Bind a controller; returns None for a constant action.
 
     The copies that an MPC plans with take too long.
     """
@@ -640,7 +640,7 @@ def _bound(env: FMUEnv, given: Any) -> Controller | None:
 
 
 def _moved(controller: Controller | None, names: Sequence[str]) -> Sequence[str]:
-    """Which of the actions a bound controller moves."""
+    """Actions that a bound controller moves."""
     if isinstance(controller, ControllerTable):
         return controller.moved
     return () if controller is None else names

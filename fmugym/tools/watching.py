@@ -1,4 +1,4 @@
-"""How far a command is: a bar in a terminal, otherwise a line now and then."""
+"""Progress of a command: a bar in a terminal, otherwise a line now and then."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HOUR: Final = 3600.0
 def watched(
     total: float | None, what: str, unit: str = "", clock: Callable[[], float] | None = None
 ) -> Iterator[Advance]:
-    """Show how far something is, and how long the rest may take.
+    """Show the progress of a command, and the time that the rest may take.
 
     Args:
         total: All that is to be done; None if that is not known.
@@ -37,7 +37,7 @@ def watched(
 
 
 def _lines(total: float | None, what: str, clock: Callable[[], float]) -> Advance:
-    """Tell every ten seconds what it is told, or which part is done."""
+    """Print progress every ten seconds: a text, or the part that is done."""
     begin = last = clock()
     done = 0.0
 

@@ -112,7 +112,7 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
 
 
 def agent_player(folder: Path) -> Player:
-    """The one who acts as the agent in a folder; raises as ``load_agent``."""
+    """Make the player of the agent in a folder; raises as ``load_agent``."""
     agent = load_agent(folder)
     return Player(partial(policy_of_controller, agent), agent.is_physical)
 
@@ -154,7 +154,7 @@ class TrainedModel:
         return self
 
     def _require_names(self, env: FMUEnv) -> None:
-        """Refuse other names than those of the training, if these are known."""
+        """Refuse names other than those of the training, if these are known."""
         here = names_of(env)
         own = {what: self._facts.get(what, names) for what, names in here.items()}
         tasks = ((one["observations"], ", ".join(one["actions"])) for one in (own, here))
@@ -243,13 +243,13 @@ def _kind(space: Any) -> str:
 
 
 def names_of(env: FMUEnv) -> dict[str, list[str]]:
-    """The names of what an agent observes and of the inputs that it writes."""
+    """Names of an agent's observations, and of the inputs that it writes."""
     seen = env.observation_names or env.config.model_output_names
     return {"observations": list(seen), "actions": list(env.config.model_input_names)}
 
 
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:
-    """Make the policy that a model is: its best action, and masked ones only where it knows masks.
+    """Make the policy of a model: its best action, masked only if it knows masks.
 
     Actions from -1 to 1 stand for the ranges of the environment's.
 

@@ -1,4 +1,4 @@
-"""Trainings that go on: everything that the next step of a training depends on, in files.
+"""Checkpoints: files with everything on which the next step of a training depends.
 
 A checkpoint is made between two updates of the agent. It has the model with its optimizer, the
 replay buffer, the normalization, the FMUs with their random streams (``FMUVectorEnv.save_state``),

@@ -1,4 +1,4 @@
-"""Who has won: agents play episodes that no search has seen."""
+"""Comparison of agents over episodes that no search has seen."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _told(
 
 
 def verdict(test: Mapping[str, Any], limits: Mapping[str, float]) -> str:
-    """Say who has won, in a line: the first agent beside the second one.
+    """Describe the result in a line: the first agent beside the second one.
 
     Args:
         test: What ``judge`` has returned.
@@ -92,7 +92,7 @@ def verdict(test: Mapping[str, Any], limits: Mapping[str, float]) -> str:
 
 
 def _beside(test: Mapping[str, Any], name: str, other: str) -> str:
-    """One agent beside another one; per cent only of totals of one sign and one magnitude.
+    """Compare an agent with another one, in per cent only for totals of one sign and magnitude.
 
     The interval is that of the differences in each episode, beside their mean in the scenario.
     """

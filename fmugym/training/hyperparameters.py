@@ -1,4 +1,4 @@
-"""Search for good arguments of an algorithm, with Optuna."""
+"""Tuning of hyperparameters of an algorithm, with Optuna."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _best_reward(
 
 
 def _suggested(trial: Any, settings: TrainingSettings, steps: int) -> dict[str, Any]:
-    """Arguments for a trial, of those that the algorithm has and the settings do not give."""
+    """Suggest arguments for a trial that the algorithm has and the settings do not give."""
     given = settings.arguments or {}
     defaults = {
         name: parameter.default

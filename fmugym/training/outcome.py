@@ -1,4 +1,4 @@
-"""What is left of a training for people to look at: the learning curve, and a report."""
+"""Results of a training for readers: the learning curve, and a report."""
 
 from __future__ import annotations
 

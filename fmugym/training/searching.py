@@ -1,4 +1,4 @@
-"""Training without gradients: a search of policies, its course on disk, and its result."""
+"""Training by a search of policies: rounds, files in its folder, and the result."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ _OF_SCENARIO: Final = 4
 """Episodes of a test, and of each scenario if the task has some."""
 
 _TRIED: Final = 2
-"""Steps that tell how long a controller takes that plans ahead."""
+"""Steps that measure the time of a controller that plans ahead."""
 
 
 @dataclass
 class Searching:
-    """A search, which writes what it finds to a folder and tests it.
+    """Run of a search, which writes its results to a folder and tests them.
 
     Attributes:
         make_env: Makes the environment, in the physical form of its task.
@@ -189,7 +189,7 @@ class Searching:
         return CandidateEvaluator(make_env, group, most_steps, self._probe.limits)
 
     def _tell_the_plan(self, is_resumed: bool) -> None:
-        """Tell what will be done, and how long."""
+        """Tell the plan and its duration."""
         probe = self._probe
         took = probe.round_time(self._found.episodes)
         left = self.seconds - (monotonic() - self._begin)
@@ -351,7 +351,7 @@ class Searching:
         return facts
 
     def _judged(self, winner: ResidualAgent) -> dict[str, Any]:
-        """Let the winner play beside the others, and write what it has reached."""
+        """Compare the winner with the others, and write the result."""
         probe, found = self._probe, self._found
         baseline = found.baseline.best if found.baseline else winner
         if found.baseline and winner is baseline:
@@ -382,7 +382,7 @@ class Searching:
         evaluators: Mapping[str, CandidateEvaluator],
         count: int,
     ) -> dict[str, Any]:
-        """Let agents play, and show how far they are; nothing that one does ends the test."""
+        """Let agents play, with a progress bar; a failure of one does not end the test."""
         usual = self._probe.seconds * self._probe.usual_steps * count * len(evaluators)
         seconds = {name: self._seconds_of.get(name, usual) for name in agents}
         with self.progress(sum(seconds.values()), "test") as advance:

@@ -71,7 +71,7 @@ _SECONDS_BETWEEN_CHECKPOINTS: Final = 30.0
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """What to train, and how.
+    """Settings of a training.
 
     Attributes:
         make_env: A function that makes the environment.
@@ -105,7 +105,7 @@ class TrainingSettings:
     records: TrainingRecords | None = None
 
     def facts(self) -> dict[str, Any]:
-        """What a training that is resumed must have in common with its beginning."""
+        """Facts that a resumed training must share with its beginning."""
         return {
             "algorithm": self.algorithm,
             "envs": self.num_envs,
@@ -144,7 +144,7 @@ def algorithm_arguments(texts: Iterable[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Watch:
-    """Who is told of a training.
+    """Listener of a training.
 
     Attributes:
         tell: Gets a line of text for each evaluation.
@@ -219,7 +219,7 @@ def _normalized(venv: Any) -> Any:
 
 
 def _recorder(settings: TrainingSettings, resume: bool) -> Callable[[FMUVectorEnv], Any]:
-    """What wraps the environments of a training."""
+    """Make the wrapper of a training's environments."""
     if settings.records is None:
         return lambda envs: envs
     begin = latest_checkpoint(settings.folder)[1] if resume else 0
@@ -253,7 +253,7 @@ def require_new(folder: Path) -> None:
 
 
 def facts_of(folder: Path) -> dict[str, Any]:
-    """What a training was begun with.
+    """Facts with which a training was begun.
 
     Raises:
         ConfigError: If there is none.
@@ -286,7 +286,7 @@ def _new_model(settings: TrainingSettings, venv: Any) -> Any:
 
 
 def _with_fitting_rollouts(settings: TrainingSettings) -> dict[str, Any]:
-    """The arguments, with shorter rollouts where there are fewer steps than usual ones have."""
+    """Shorten rollouts for a training with fewer steps than a usual rollout."""
     own, most = dict(settings.arguments or {}), settings.steps // settings.num_envs
     default = inspect.signature(algorithm_of(settings.algorithm)).parameters.get("n_steps")
     if default is not None and 0 < most < default.default:
@@ -456,7 +456,7 @@ class _Training:
         self._watch.evaluated(steps, mean)
 
     def _player(self) -> Player:
-        """The one who acts as the agent does now."""
+        """Player of the agent as it is now."""
         if self._settings.residual is None:
             make_policy = partial(policy_with, self._model, self._normalization())
             return Player(make_policy, is_physical=False)
@@ -481,7 +481,7 @@ class _Training:
         ]
 
     def _wrap(self, name: str) -> Wrap:
-        """What wraps the environment of an evaluation."""
+        """Make the wrapper of an evaluation's environment."""
         settings = self._settings
         if settings.records is None:
             return lambda env: env
@@ -507,7 +507,7 @@ class _Training:
 
 
 def _writer_to(tracker: Tracker, base: Any) -> Any:
-    """What writes the log of Stable-Baselines3 to a tracker; it must be one of its own classes."""
+    """Make a writer from the log of Stable-Baselines3 to a tracker, of the library's own class."""
     methods = {
         "write": lambda self, values, excluded, step=0: tracker.log(values, step),
         "close": lambda self: None,

@@ -1,4 +1,4 @@
-"""What a training writes down beside the agent: recordings, the learning curve, a report."""
+"""Records of a training beside the agent: recordings, the learning curve, a report."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _FORMATS: Final = ("csv", "parquet")
 
 @dataclass(frozen=True)
 class TrainingRecords:
-    """What to write down of a training.
+    """Settings of the records of a training.
 
     Attributes:
         variables: Globs, as of ``RecordSeries``.
@@ -62,7 +62,7 @@ class TrainingRecords:
 
     @classmethod
     def of(cls, facts: Any) -> TrainingRecords | None:
-        """That of a training that is resumed, from its facts; None if it had none.
+        """Records of a resumed training, from its facts; None if it had none.
 
         Raises:
             ConfigError: If the facts are damaged.
@@ -80,7 +80,7 @@ class TrainingRecords:
         return asdict(self)
 
     def of_training(self, folder: Path, begin: int) -> Callable[[FMUVectorEnv], Any]:
-        """What wraps the environments of the training.
+        """Make the wrapper of the training's environments.
 
         Args:
             folder: That of the training. The file is made in the first step.
@@ -99,7 +99,7 @@ class TrainingRecords:
         return wrap
 
     def of_evaluation(self, folder: Path, steps: int, name: str) -> Callable[[FMUEnv], Any]:
-        """What wraps the environment of an evaluation after some steps; a file is replaced."""
+        """Make the wrapper of an evaluation's environment; its file is replaced."""
         safe = re.sub(r"[^\w.-]+", "_", name)
         path = folder / RECORDS / f"evaluation-{steps}-{safe}.{self.format}"
 
@@ -132,14 +132,14 @@ def append_row(
 
 
 def curve_of(folder: Path) -> Mapping[str, list[float]]:
-    """The columns of ``evaluations.csv``: steps, mean reward, and that of each scenario."""
+    """Columns of ``evaluations.csv``: steps, mean reward, and the mean of each scenario."""
     with (folder / EVALUATIONS).open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
 def _limits(curves: Iterable[Sequence[float]]) -> tuple[float, float]:
-    """Those of the axis of rewards: the first quarter of a training may leave them."""
+    """Limits of the axis of rewards, which the first quarter of a training may leave."""
     shown = [value for curve in curves for value in curve[len(curve) // 4 :]]
     margin = 0.08 * (max(shown) - min(shown)) or 1.0
     return min(shown) - margin, max(shown) + margin

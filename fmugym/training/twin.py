@@ -1,4 +1,4 @@
-"""A search on a surrogate of an FMU, whose result is proved on the FMU."""
+"""Search on a surrogate of an FMU, with its results proved on the FMU."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PROVED: Final = VALIDATION + 2000
 
 _TOLD: Final = VALIDATION + 3000
 _PREDICTED: Final = 32
-"""The first seed of those, and how many, that the surrogate plays for a prediction."""
+"""First seed and number of the episodes that the surrogate plays for a prediction."""
 
 _EXCITED: Final = 0.4
 """The part of all steps that excite the FMU,"""
@@ -33,11 +33,11 @@ _FEWEST: Final = 4
 """in at least so many episodes."""
 
 _FEWEST_PLAYED: Final = 6
-"""The steps have so many episodes at least: those that excite, one of the tuned controller and one
-of a policy."""
+"""Least number of episodes for the steps: the exciting ones, one of the tuned controller and one of
+a policy."""
 
 _DIVIDED: Final = 16
-"""Where they have more than so many, episodes are as long as those of the task."""
+"""From so many episodes on, they are as long as the task's."""
 
 _CYCLES: Final = 5
 _FIRST: Final = 300
@@ -45,14 +45,14 @@ _MORE: Final = 80
 """Rounds of the search until the first proof, and from one proof to the next."""
 
 _CLOSE: Final = 0.2
-"""A prediction is good enough if it is wrong by this part of what is gained."""
+"""Tolerated error of a prediction, as a part of the gain."""
 
 _MANY: Final = 256
 """So many surrogates step together."""
 
 
 class Proof(NamedTuple):
-    """What an agent has reached on the FMU.
+    """Result of an agent on the FMU.
 
     Attributes:
         agent: The agent.
@@ -66,7 +66,7 @@ class Proof(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """How good an agent is, and what the surrogate says of the episodes that it has played."""
+    """Estimate of an agent's merit, with the surrogate's predictions of its episodes."""
 
     merit: Merit
     predicted: float
@@ -155,7 +155,7 @@ class TwinSearch:
         return found
 
     def _evaluator_on(self, surrogate: Surrogate) -> CandidateEvaluator:
-        """Where the surrogate plays, whole episodes."""
+        """Evaluator on the surrogate, of whole episodes."""
         probe = self.found.probe
         return CandidateEvaluator(
             self.evaluator.make_env, _MANY, probe.most_steps, probe.limits, backend=surrogate
@@ -174,14 +174,14 @@ class TwinSearch:
 
     @property
     def _episodes(self) -> int:
-        """How many episodes of the FMU prove an agent."""
+        """Number of episodes of the FMU that prove an agent."""
         return (
             2 if self.length == self.found.probe.most_steps and not self.found.probe.is_same else 1
         )
 
     @property
     def _left(self) -> int:
-        """How many agents may be proved with the steps that are left."""
+        """Number of agents that the rest of the steps can prove."""
         return int((self.steps - self.evaluator.steps) // (self.length * self._episodes))
 
     def _prove(self) -> None:
@@ -199,7 +199,7 @@ class TwinSearch:
             self.proofs.append(Proof(agent, seeds, agent.play(self.evaluator, seeds)))
 
     def _values(self, twin: CandidateEvaluator) -> list[Standing]:
-        """How good the agents are that have played on the FMU."""
+        """Merits of the agents that have played on the FMU."""
         return [self._value(one, twin) for one in self.proofs]
 
     def _value(self, proof: Proof, twin: CandidateEvaluator) -> Standing:
@@ -218,7 +218,7 @@ class TwinSearch:
         return Standing(corrected.merits[0], predicted, measured)
 
     def _tell_of(self, values: Sequence[Standing]) -> None:
-        """Tell what the surrogate has predicted, and what the FMU gives."""
+        """Report the predictions of the surrogate, and the results on the FMU."""
         for proof, value in zip(self.proofs, values, strict=True):
             self.tell(
                 f"{proof.agent.name}: predicted {value.predicted:.5g}, measured "
@@ -227,6 +227,6 @@ class TwinSearch:
 
 
 def _is_close(values: Sequence[Standing], best: int) -> bool:
-    """Whether the surrogate is close enough to what the FMU gives, beside what is gained."""
+    """Whether the errors of the surrogate are small compared with the gain."""
     wrong = abs(values[best].predicted - values[best].measured)
     return wrong <= _CLOSE * abs(values[best].merit[1] - values[0].merit[1])

@@ -30,7 +30,7 @@ _Node = tuple[Path, str]
 
 @dataclass(frozen=True)
 class _Value:
-    """A value on its way through connectors, with its gain, offset and unit; None if unknown.
+    """A value on its way through connectors: its conversion and its unit; None if unknown.
 
     ``units`` has the definition of the unit.
     """
