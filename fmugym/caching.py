@@ -42,7 +42,7 @@ def cache_folder(*names: str) -> Path:
     Windows ``LOCALAPPDATA``. A folder that is missing is made.
 
     Args:
-        names: Of a folder in it.
+        names: Names on the path to a folder in it.
 
     Raises:
         OSError: If there can be none, or others may write to it.

@@ -336,7 +336,7 @@ class Spellings:
     Names count as equal if their normal forms NFKC are, as in Python. An exact name wins.
 
     Args:
-        kind: What the names name, for the error.
+        kind: Kind of the named things, for the error.
         names: The names.
     """
 
@@ -388,7 +388,7 @@ def by_own_names(
     """Resolve the names of a dict to the own names of the named things.
 
     Args:
-        what: What is given, for the error.
+        what: Name of the given thing, for the error.
         given: Values by name.
         own_name: Finds the own name for a given one.
 
@@ -433,8 +433,8 @@ def parts_of_array(name: str, shape: tuple[int, ...], value: Any) -> list[Any]:
     """Give each element of an array its part of a value.
 
     Args:
-        name: That of the array, for the error.
-        shape: Of the array.
+        name: Name of the array, for the error.
+        shape: Shape of the array.
         value: Nested lists of this shape, a flat list in row-major order, or one value for all.
 
     Raises:

@@ -401,8 +401,8 @@ def together(distributions: Sequence[Any], recipes: Sequence[Recipe]) -> list[Re
     """Let recipes draw as ``draw_all`` does.
 
     Args:
-        distributions: What is drawn from.
-        recipes: Of each by itself.
+        distributions: Distributions to draw from.
+        recipes: Recipe of each distribution.
 
     Returns:
         The recipes; None if columns of a table do not stand side by side.

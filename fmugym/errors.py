@@ -198,7 +198,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     """Make the error for a name that does not exist.
 
     Args:
-        kind: What the name should have named, for example ``"config key"``.
+        kind: Kind of the named thing, for example ``"config key"``.
         name: The name that was given.
         known: All valid names.
 

@@ -24,7 +24,7 @@ def lacking(what: str, library: str, extra: str) -> str:
     """Describe a missing library, and its installation.
 
     Args:
-        what: What needs it.
+        what: Name of the feature that needs it.
         library: Its name.
         extra: The extra that installs it.
     """
@@ -48,7 +48,7 @@ def c_compiler(what: str, target: str | None = None, *, is_own: bool = True) -> 
     """Find the command of a compiler for C: that of this system, or ziglang.
 
     Args:
-        what: What is to be built, for the error.
+        what: Name of the built thing, for the error.
         target: The target triple that ziglang builds for; None for this processor.
         is_own: Whether it is for this platform, so that the compiler of the system serves.
 

@@ -48,7 +48,7 @@ def replaced(path: Path) -> Iterator[Path]:
     """Replace one file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
 
     Yields:
         Where to write it first.

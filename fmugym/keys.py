@@ -77,7 +77,7 @@ class Listed:
     """A list of values of one kind.
 
     Attributes:
-        kind: That of the values.
+        kind: Kind of the values.
         or_one: Whether a single value stands for a list of one.
         most: How many there may be; None for any number.
     """
@@ -92,7 +92,7 @@ class Entries:
     """A table of values of one kind under names of the user's choice.
 
     Attributes:
-        kind: That of the values.
+        kind: Kind of the values.
         most: How many there may be; None for any number.
     """
 
@@ -114,7 +114,7 @@ class Table:
 
     Attributes:
         keys: By name.
-        what: What a key of it is called, for errors.
+        what: Name of a key of it, for errors.
         short: The key whose value may stand for the table; "" for none.
         one_of: Exactly one of these must be given.
         elsewhere: Names that are no keys of it, and what to do instead.
@@ -136,8 +136,8 @@ class Key(NamedTuple):
     """A key of a table.
 
     Attributes:
-        kind: What its value may be.
-        text: What it means, in Markdown.
+        kind: Kind of its value.
+        text: Meaning, in Markdown.
         default: Its value where it is not given; ``REQUIRED`` if it must be given.
         shown: The default in words, for the documents, if the value does not tell it.
     """
@@ -153,7 +153,7 @@ class Mistake(NamedTuple):
 
     Attributes:
         keys: The keys that lead to it.
-        text: What was expected, and what was given.
+        text: Expected and given value.
         is_unknown: Whether there is no such key.
     """
 
@@ -181,7 +181,7 @@ def found_mistakes(kind: AnyKind, value: Any) -> tuple[Any, list[Mistake]]:
     """Check a value, and find everything that is wrong with it.
 
     Args:
-        kind: What it may be.
+        kind: Kind of the value.
         value: As the user gave it.
 
     Returns:
@@ -293,7 +293,7 @@ def with_paths(kind: AnyKind, value: Any, path_of: Callable[[str], str]) -> Any:
     """Return a value as the user gave it, with other paths.
 
     Args:
-        kind: What it may be.
+        kind: Kind of the value.
         value: The value.
         path_of: Takes a path, and returns the new one.
     """
@@ -335,7 +335,7 @@ def table_of_fields(cls: Any, **options: Any) -> Table:
 
     Args:
         cls: The class.
-        options: Of the ``Table``.
+        options: Options of the ``Table``.
     """
     return Table({one.name: one.metadata["key"] for one in fields(cls)}, **options)
 

@@ -79,7 +79,7 @@ class FMUParallelEnv(ParallelEnv[str, Array, Array]):
     Attributes:
         env: As given.
         possible_agents: The names of the agents.
-        agents: Those that are acting: all of them in an episode, none after its end.
+        agents: Agents that are acting: all of them in an episode, none after its end.
 
     Raises:
         ConfigError: If the spaces do not fit, a name is unknown, or an action belongs to no agent

@@ -253,7 +253,7 @@ class ReplayReport:
     Attributes:
         steps: How many steps were replayed.
         difference: The first difference; "" if all is equal to the last bit.
-        surroundings: What was otherwise when the episode was recorded, by name: then and now.
+        surroundings: Differences in the surroundings, by name: then and now.
     """
 
     steps: int

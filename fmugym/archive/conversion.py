@@ -63,7 +63,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     """Make a model description.
 
     Args:
-        source: What FMPy has read.
+        source: Model description as FMPy reads it.
         root: The root of the XML.
         interface: One of ``INTERFACES``; None for the first of them that the FMU offers.
 

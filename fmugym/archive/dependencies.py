@@ -40,7 +40,7 @@ class _Needed(NamedTuple):
 
     Attributes:
         name: Its name.
-        path: Where it is among the files of the FMU, or None.
+        path: Path among the files of the FMU, or None.
         found: Whether the loader finds it there.
     """
 

@@ -127,13 +127,13 @@ class ModelDescription:
     """The part of a model description that an environment needs.
 
     Attributes:
-        model_identifier, capabilities: Those of the interface in use.
+        model_identifier, capabilities: Identifier and capabilities of the interface in use.
         interfaces: The interface types that the FMU offers.
         interface: The one in use, one of ``INTERFACES``.
-        model_exchange: What a solver needs; None in co-simulation.
+        model_exchange: Facts for a solver; None in co-simulation.
         start_time, stop_time, step_size, fixed_internal_step_size: In seconds; None where the FMU
             gives no usable value.
-        tolerance: Of the default experiment; None where the FMU gives no usable value.
+        tolerance: Tolerance of the default experiment; None where the FMU gives no usable value.
         variables: The variables by name, in the order of the XML, but for the ``namesakes``.
         namesakes: The variables of each name that is not unique, which cannot be used.
         derivatives: For each continuous state that the FMU declares, a scalar or an array, the name

@@ -93,7 +93,7 @@ class FMU(KnownArguments):
 
     Args:
         path: The ``.fmu`` file.
-        limits: What is too large to be opened; by default ``ArchiveLimits()``.
+        limits: Limits of the size of an archive; by default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's, which may need them: paths, or names
             that the system's loader finds.
         probe_timeout: Seconds that a call of an unknown FMU may take in a trial in a process of its
@@ -485,7 +485,7 @@ class FMU(KnownArguments):
         """Extract the files that are needed and not there; returns whether there are any.
 
         Args:
-            folder: Where to.
+            folder: Target folder.
             only: The one folder of the archive whose files are needed; by default several are.
         """
         files = {p: self._target(p) for p in self._archive.files if self._needed(p, only)}

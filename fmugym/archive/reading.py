@@ -256,7 +256,7 @@ def parse_xml(name: str, place: str, content: bytes) -> Any:
     Args:
         name: The name of the archive, for errors.
         place: The place of the file, for errors.
-        content: What ``read_xml`` returned.
+        content: Result of ``read_xml``.
 
     Returns:
         The root, an element of lxml.

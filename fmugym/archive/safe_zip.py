@@ -95,14 +95,14 @@ class SafeZip:
 
     Args:
         path: The archive.
-        limits: What is too large.
+        limits: Limits of sizes.
 
     Attributes:
         path, limits: As given.
         files: zipfile's record of each file, by its place: a relative path with slashes, inside of
             the folder to which the archive is extracted.
         folders: The places of the folders that have an entry of their own.
-        notes: What was untidy, as texts.
+        notes: Descriptions of untidy places.
 
     Raises:
         FMULoadError: If it is no zip archive, too large, or not sound.
@@ -284,7 +284,7 @@ class SafeZip:
         """Write files and folders.
 
         Args:
-            folder: Where to write.
+            folder: Target folder.
             files: The place in ``folder`` of each file, by its place in the archive.
             folders: Places in ``folder`` of folders to make, which may stay empty.
 
@@ -370,8 +370,8 @@ def check_limit(found: str, value: int, limit: int, name: str) -> None:
     """Refuse a size above a limit.
 
     Args:
-        found: What was found, with the name of the FMU.
-        value: How large it is.
+        found: Description of the file, with the name of the FMU.
+        value: Its size.
         limit: The limit.
         name: The attribute of ``ArchiveLimits`` that sets the limit.
 

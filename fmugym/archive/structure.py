@@ -36,7 +36,7 @@ def read_feedthrough(root: Any, description: ModelDescription) -> Feedthrough:
 
     Args:
         root: The root of the XML.
-        description: What has been read of it.
+        description: Variables that have been read.
     """
     inputs = frozenset(_named(description, "input"))
     outputs = list(_named(description, "output"))

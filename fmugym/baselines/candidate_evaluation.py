@@ -98,16 +98,16 @@ class CandidateEvaluator:
         make_env: A function that makes the environment, or its class.
         most_envs: The largest number of environments.
         most_steps: Steps after which an episode is stopped.
-        limits: What costs may add up to in an episode, by name.
+        limits: Limits of the costs of an episode, by name.
         steps: The steps of all episodes until now.
         seconds: The real time that they have taken.
         ceiling: The largest number of steps.
         longest: The steps of the longest episode until now.
-        infos: Those of the last step.
+        infos: Infos of the last step.
         jobs: Which job each environment plays, shape (N,), before ``play`` makes a controller; -1
             for none. Job ``i * k + j`` is episode j of k of candidate i.
         advance: Is told of each step, as a part of all that ``play`` has to do.
-        backend: What steps in the place of the FMU; see ``FMUVectorEnv``.
+        backend: Backend in the place of the FMU; see ``FMUVectorEnv``.
     """
 
     make_env: Callable[[], Any]
@@ -142,7 +142,7 @@ class CandidateEvaluator:
         Args:
             make: Makes one controller for N environments, from the numbers of each of them, shape
                 (N, k).
-            numbers: What the candidates differ in, shape (n, k).
+            numbers: Numbers of the candidates, shape (n, k).
             seeds: The seeds of their episodes.
             has_moments: Whether to add up ``moments`` of controllers, which they have after each
                 decision, shape (r, N).

@@ -34,10 +34,10 @@ class CandidateSearch:
         make: Makes a controller for N environments from their numbers, shape (N, n). For
             validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.
-        then: What enters when this one gains nothing; None for nothing.
+        then: Class of candidates that enters when this one gains nothing; None for nothing.
         first: The candidates of the first round, shape (n, k); ``cma`` goes on from the best of
             them. None if ``cma`` draws them.
-        rounds: How many it has had.
+        rounds: Number of its rounds.
         leader: The numbers of the best candidate since the last validation, shape (n,).
         lead: Its merit.
         best: The agent with the best numbers in validation; None before the first one.

@@ -110,7 +110,7 @@ class Controller(KnownArguments, ABC):
         """Choose actions.
 
         Args:
-            observation: Of shape (k,), or (N, k) for a vector environment.
+            observation: Observation of shape (k,), or (N, k) for a vector environment.
             info: The infos that came with it; no controller of this package reads them.
 
         Returns:
@@ -164,7 +164,7 @@ class Controller(KnownArguments, ABC):
         Args:
             observation: Its elements, as float64.
             memory: The numbers that it remembers.
-            added: What is added to the elements of the action, see ``add``.
+            added: Correction of the elements of the action, see ``add``.
 
         Returns:
             The elements of the action, before they are limited, and the numbers that it remembers

@@ -35,7 +35,7 @@ class Hysteresis(Law):
 
     Args:
         of: The name of what is measured.
-        setpoint: What it shall be: a name or a constant.
+        setpoint: Set point: a name or a constant.
         band: The controller switches where the measured value leaves the set point by this much.
         below: The action below the band; it holds until the value is above the band.
         above: The action above the band.
@@ -87,7 +87,7 @@ class PID(Law):
 
     Args:
         of: The name of what is measured.
-        setpoint: What it shall be: a name or a constant.
+        setpoint: Set point: a name or a constant.
         kp: The gain, in units of the action per unit of the measured value. A negative gain is for
             actions that lower the value.
         ti: The integral time in s; without one there is no integral part.

@@ -50,7 +50,7 @@ class Random(Controller):
     """Samples the action space.
 
     Args:
-        seed: Of the samples; the same seed gives the same actions after each ``bind``.
+        seed: Seed of the samples; the same seed gives the same actions after each ``bind``.
     """
 
     is_physical = False
@@ -75,7 +75,7 @@ class Schedule(Law):
         start: The time of day at which an episode begins.
 
     Attributes:
-        clock: What tells the time in seconds since any midnight; None to count it from ``start``.
+        clock: Name of the time in seconds since any midnight; None to count it from ``start``.
     """
 
     signals = ("clock",)

@@ -39,9 +39,9 @@ class Law(Controller):
 
         Args:
             seen: The elements of the observation.
-            state: What the controller remembers, in the order of ``starts``.
+            state: Memory of the controller, in the order of ``starts``.
             holds: Whether an integral must not grow, because nothing would follow it.
-            added: What is added to each element of the action; None for nothing. See
+            added: Correction of each element of the action; None for nothing. See
                 ``Controller.add``.
         """
 

@@ -91,7 +91,7 @@ class MPC(Controller):
             needs all states, and a task without data.
         perfect: Whether the true state and the true future are known. Nobody can beat this but by
             a better search; it shows how much there is to gain.
-        seed: Of the candidates. The same arguments give the same actions.
+        seed: Seed of the candidates. The same arguments give the same actions.
         model: A function that makes the environment to plan with, which has the observations and
             actions of the controlled one. By default that is copied; the environments of
             ``fmugym.plant`` know one. Or ``"surrogate"``: plans are tried on a surrogate of the
@@ -499,7 +499,7 @@ class _Plan(NamedTuple):
     Attributes:
         value: The return.
         numbers: The actions until the horizon, from 0 to 1, shape (steps, m).
-        costs: Those of the first step by name.
+        costs: Costs of the first step by name.
     """
 
     value: float
@@ -511,8 +511,8 @@ class _Episode:
     """Knowledge about the episode of one environment.
 
     Attributes:
-        snapshot: Where the copies are.
-        seen: What they observe, shape (n, k).
+        snapshot: State of the copies.
+        seen: Observations, shape (n, k).
         observer: Knows which copy fits best, and what is added to the outputs of each.
         have_ended: Whether their episodes have ended; the last snapshot stays.
         plan: The latest plan, from 0 to 1, shape (steps, m).
@@ -545,10 +545,10 @@ class _Foresight:
     """Forecasts of data, made of observations.
 
     Args:
-        names: Those of the observation's elements.
+        names: Names of the observation's elements.
         future: Has the data.
         time_step: The length of a step in s.
-        steps: Those until the horizon.
+        steps: Steps until the horizon.
 
     Attributes:
         is_present: Which elements are present values, shape (k,).

@@ -37,7 +37,7 @@ class Observer:
 
     Attributes:
         errors: The sums of squared differences from what was measured, shape (n, k).
-        offsets: What is added to the outputs of each copy, shape (n, o).
+        offsets: Corrections of the outputs of each copy, shape (n, o).
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Observer:
         """Let the offsets follow.
 
         Args:
-            wanted: What the outputs of each copy lack now, shape (n, o).
+            wanted: Present errors of the outputs of each copy, shape (n, o).
             which: The outputs that are known.
         """
         self.offsets = self.offsets + which * self._correction * (wanted - self.offsets)

@@ -185,7 +185,7 @@ class TableSearch(TunableController):
     """The search for all numbers of a table, whose names are such as ``"u.kp"``.
 
     Attributes:
-        entries: Those of the table.
+        entries: Entries of the table.
         searches: By entry, those of the controllers that have ranges.
     """
 

@@ -122,7 +122,7 @@ def resolved(given: Any, known: Mapping[str, Any]) -> Any:
 
     Args:
         given: A text, a number or a table.
-        known: What names stand for.
+        known: Controllers by name.
 
     Raises:
         ConfigError: If a name in a table is no controller of one number.

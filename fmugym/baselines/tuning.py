@@ -53,7 +53,7 @@ def candidate_search_of(
 
     Args:
         make: As for a ``CandidateSearch``.
-        ranges: What ``numbers_at`` takes.
+        ranges: Ranges of the numbers, as ``numbers_at`` takes them.
         sizes: The candidates of the first round, and of the others.
         episodes: How many each candidate plays.
         rng: Draws them.
@@ -116,7 +116,7 @@ def tune(
         episodes: How many episodes each of them plays. Those of all rounds are the same.
         rounds: The number of rounds.
         most_steps: Steps after which an episode is stopped.
-        seed: Of the candidates and of the episodes.
+        seed: Seed of the candidates and of the episodes.
         watch: Gets the best candidate until now after each round.
         advance: Is told of each step, as a part of a round.
 

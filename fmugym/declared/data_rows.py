@@ -31,10 +31,10 @@ class DataRows:
     """Rows of data as they stand in a file or a list.
 
     Attributes:
-        entry: Where they are declared.
+        entry: Entry of the task.
         table: The table that they are from.
         value: The column of values; NaN is an empty cell.
-        time: That of times; None if there is only a distance between rows.
+        time: Column of times; None if there is only a distance between rows.
         dates: The times on the standard time; None if they are seconds.
         times: Seconds since the beginning of the year, shape (n,); NaN on 29 February.
     """
@@ -181,7 +181,7 @@ def read_rows(entry: Entry, standard: int | None = None) -> DataRows:
     """Read the rows of a file or of a list.
 
     Args:
-        entry: Where they are declared.
+        entry: Entry of the task.
         standard: The offset of the standard time in seconds east of UTC; None for the smallest
             offset of the rows.
 
@@ -253,7 +253,7 @@ def utc_offsets_of(entry: Entry) -> tuple[str, int | None, tuple[int, ...]]:
     """The offsets from UTC that data tell, in seconds.
 
     Args:
-        entry: Where the data are declared.
+        entry: Entry of the task.
 
     Returns:
         The name of the file, the offset in its header or None, and those of its dates.

@@ -38,7 +38,7 @@ class DataColumn:
         name: Its name.
         cells: Texts, numbers, or moments of numpy.
         rows: The numbers of its rows in the file, shape (n,).
-        zone: Of moments, which are then those of UTC; None if they have none.
+        zone: Zone of moments, which are then those of UTC; None if they have none.
         may_have_commas: Whether a number may have a decimal comma.
         of_year: Whether its numbers are seconds of the year, which an error shows as dates.
     """
@@ -187,11 +187,11 @@ class DataTable:
 
     Attributes:
         columns: In the order of the file.
-        separator: What stands between cells, in words; "" where nothing does.
+        separator: Name of the separator of cells; "" for none.
         period: Seconds after which the rows repeat; None for one more row than there are.
         means: By name, for columns of means, the seconds before a row that it is the mean of.
         longest_gap: The longest time without a value, in seconds; None if nothing is known.
-        offset: That of its times, in seconds east of UTC, if its header tells it.
+        offset: Offset of its times, in seconds east of UTC, if its header tells it.
     """
 
     columns: Sequence[DataColumn]

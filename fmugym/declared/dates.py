@@ -153,7 +153,7 @@ class Dates:
     """The dates of rows.
 
     Attributes:
-        walls: What a clock on the wall shows, shape (n,).
+        walls: Local times without offsets, shape (n,).
         offsets: Seconds east of UTC, shape (n,); None if the dates do not tell them.
     """
 

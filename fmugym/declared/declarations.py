@@ -63,7 +63,7 @@ class Declarations:
             ``Task.physical``.
         parameters: Parameters and start values by alias: the variable, and a value or distribution
             in the unit of the FMU.
-        memory, derived: What the task remembers and names, by name.
+        memory, derived: Memory variables and named expressions, by name.
         series: Data and schedules by name.
         files: By episode variable, the numbers of the files that an episode may take.
         steps: Set points that jump, by name.
@@ -75,9 +75,9 @@ class Declarations:
         remembered: The names of which it sees the history.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
-        deviations: What the names of deviations from set points stand for.
-        kpis: What tells how good an episode was, by name.
-        warm_up: What happens before an episode begins.
+        deviations: Deviations from set points, by name.
+        kpis: KPIs by name.
+        warm_up: Warm-up before an episode.
     """
 
     def __init__(

@@ -30,13 +30,13 @@ class Device:
 
     Attributes:
         delay: By how many seconds it is late.
-        bias: What it adds: a number, or a distribution of one number in each episode.
+        bias: Added bias: a number, or a distribution of one number in each episode.
         noise: The standard deviation of what it adds in each step.
         saturation: The lowest and highest value that it gives; None for no limit.
         quantum: It gives multiples of this; 0 for any value.
         rate: The largest change in a second; infinite for no limit.
         drop_out: The probability that it gives no new value in a step.
-        substitute: What it gives then; None for the value before.
+        substitute: Value of a lost sample; None for the value before.
     """
 
     delay: float = 0.0

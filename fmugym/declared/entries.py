@@ -27,7 +27,7 @@ class Source(NamedTuple):
 
     Attributes:
         path: The file; None for a dict.
-        folder: Where relative paths start.
+        folder: Base of relative paths.
         text: The text of the file.
         document: Its values.
     """
@@ -107,7 +107,7 @@ class Entry:
         value: The value.
         keys: The keys that lead to it.
         sources: The files that the task is made of; the first that has the value counts.
-        mistakes: Those that are known of the task.
+        mistakes: Mistakes that are known of the task.
         element: The text of an element of a list, which tells its line.
     """
 
@@ -140,7 +140,7 @@ class Entry:
         """Make an error for values that are missing in this table, unless a mistake explains it.
 
         Args:
-            text: What is missing.
+            text: Description of the missing thing.
             keys: Their keys; none for this value itself.
         """
         places = [(*self.keys, key) for key in keys] or [self.keys]

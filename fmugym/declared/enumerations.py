@@ -61,10 +61,10 @@ def check_written(
     """Check the known values of an expression that is written to an Enumeration.
 
     Args:
-        entry: Where the expression stands.
-        variable: What it writes.
+        entry: Entry of the task.
+        variable: Written variable.
         value: Its value.
-        memory: What the task remembers, by name.
+        memory: Memory variables of the task, by name.
 
     Raises:
         ConfigError: If it writes a number that is no item.

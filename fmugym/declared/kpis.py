@@ -17,7 +17,7 @@ class Kpi(NamedTuple):
     """A figure of an episode.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         expression: Its value in a step; or an expression of other figures.
         how: The key of the format that has the expression; None for an expression of other figures.
     """

@@ -233,8 +233,8 @@ class Misreading:
 
     Attributes:
         name: Its name in the task.
-        text: What tells it.
-        line: What to write in ``[variables]``.
+        text: Description of the reason.
+        line: Line for ``[variables]``.
         contradicts: Whether its values contradict its limits in the task.
         is_converted: Whether the task takes it for a unit.
     """

@@ -36,7 +36,7 @@ class Mistakes:
         """Note a mistake.
 
         Args:
-            text: What is wrong, and where.
+            text: Description of the mistake and its place.
             keys: The keys of the value.
             place: The number of its file, and the line; mistakes are told in this order.
             is_unknown: Whether there is no key of this name.

@@ -173,7 +173,7 @@ class Naming:
         """Evaluate an expression.
 
         Args:
-            entry: Where it stands.
+            entry: Entry of the task.
             expression: The expression.
             moment: When it is evaluated.
             others: The values of more names.
@@ -236,7 +236,7 @@ class Naming:
         """The value of a name at another time.
 
         Args:
-            entry: Where the forecast stands.
+            entry: Entry of the task.
             name: Something that depends on time only.
             ahead: Seconds from now; negative for the past.
 

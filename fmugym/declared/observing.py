@@ -65,8 +65,8 @@ class Seen(NamedTuple):
     """A number that the agent observes.
 
     Attributes:
-        entry: Where it is declared.
-        name: What it is the value of.
+        entry: Entry of the task.
+        name: Name of the value.
         value: Its value.
         limits: Its limits.
         place: Which value of a forecast or history it is, such as ``"[+3600 s]"``.
@@ -85,7 +85,7 @@ class History(NamedTuple):
     Attributes:
         name: The name.
         variable: The episode variable that holds them, the latest first.
-        length: How many they are.
+        length: Number of the values.
         now: The value that is added when the FMU has stepped.
         fill: The other values in the first step.
         first: All values at the beginning of an episode.
@@ -292,7 +292,7 @@ def _with_error(
 
     Args:
         value: The true value.
-        errors: How forecasts err, by the keys of the format.
+        errors: Errors of forecasts, by the keys of the format.
         part: The time ahead as a part of the horizon.
         count: The number of the step that the forecast is made for.
         channel: The number of the forecast.

@@ -75,15 +75,15 @@ class ResolvedTask:
 
     Attributes:
         config: The config for ``FMUEnv``.
-        formulas: What the task computes.
+        formulas: Formulas of the task.
         hooks: Functions of the environment by the names of the hooks that they are, for spaces and
             for what is said of rewards.
         observation_names: The names of the elements of the observation.
-        action_names: Those of the action.
+        action_names: Names of the action's elements.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if an action has no levels.
-        warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
-        cost_limits: What the costs of an episode may add up to, by name.
+        warm_up: Controllers of warm-ups; None if there is none, or inputs do not move in it.
+        cost_limits: Limits of the costs of an episode, by name.
         unphysical_keys: The keys for which observations or actions are not in the task's units.
         expressions: All expressions of the task.
 

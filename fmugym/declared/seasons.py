@@ -27,7 +27,7 @@ class Scenario(NamedTuple):
 
     Attributes:
         start: When it begins, in seconds since the beginning of the year.
-        length: How long it is, in seconds.
+        length: Length in seconds.
         files: The numbers of its files, by their episode variables; of others it has any.
     """
 
@@ -72,7 +72,7 @@ def read_begin(
 
     Args:
         entry: A time or date, a distribution of seconds, a list of times and dates, or a season.
-        scenarios: What a season may exclude.
+        scenarios: Scenarios that a season may exclude.
         length: The length of an episode in seconds; 0 if it has no limit.
         before: The length of a warm-up with the data of the time before the beginning.
         files: The numbers of files from which an episode draws one, by episode variable.

@@ -29,10 +29,10 @@ class Term:
     """A named reward or cost.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         expression: Its value in a step.
         weight: The factor of a reward.
-        limit: What the costs of an episode may add up to; None for no limit.
+        limit: Limit of the costs of an episode; None for no limit.
     """
 
     entry: Entry
@@ -46,7 +46,7 @@ class MemoryVariable:
     """A variable that the task keeps from step to step.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         start: Its value at the beginning: a number or a distribution.
         update: Its value after a step; None to keep it.
         limits: For the observation space.

@@ -31,7 +31,7 @@ class Series:
     """A function of time that repeats itself.
 
     Attributes:
-        entry: Where it is declared.
+        entry: Entry of the task.
         start: The time in seconds of the first row.
         period: Seconds after which it repeats.
         times: Seconds since ``start``, rising.
@@ -39,7 +39,7 @@ class Series:
         is_stepped: Whether the values jump, and hold until the next one.
         limits: For the observation space.
         unit: The unit of the values; None if none is declared.
-        others: Those of the other files, if an episode draws one of several.
+        others: Series of the other files, if an episode draws one of several.
         variable: The episode variable with the number of the file; "" if there is only one.
     """
 
@@ -81,7 +81,7 @@ class Series:
         """Make a series of rows.
 
         Args:
-            entry: Where it is declared; ``min``, ``max`` and ``unit`` are read from it.
+            entry: Entry of the task; ``min``, ``max`` and ``unit`` are read from it.
             times: The times of the rows in seconds.
             values: Their values.
             period: Seconds after which the rows repeat.
@@ -122,7 +122,7 @@ def read_data(entry: Entry, standard: int | None = None) -> Series:
     """Read a column of a file or of each of several, or a list of values.
 
     Args:
-        entry: Where it is declared.
+        entry: Entry of the task.
         standard: The offset of the task's standard time in seconds east of UTC; None for the
             smallest offset of the rows.
 

@@ -31,7 +31,7 @@ class Steps:
     """A set point that jumps to a new random value now and then.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         limits: The values lie between these.
         every: Seconds from one value to the next.
         channel: Its number, from which its values follow.
@@ -63,8 +63,8 @@ class SetPoints:
         memory: Gets those that are constant or drawn, and the numbers of curves.
         series: Gets those that depend on the time of day.
         derived: Gets those that follow a curve or data, and the deviations.
-        steps: Those that jump.
-        deviations: What the names of deviations stand for.
+        steps: Set points that jump.
+        deviations: Deviations from set points, by name.
         brought: The names that curves and deviations bring with them.
     """
 

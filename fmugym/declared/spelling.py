@@ -36,7 +36,7 @@ def as_declared(root: Entry, description: ModelDescription) -> tuple[Entry, Name
 
     Args:
         root: The table of all keys.
-        description: That of the FMU.
+        description: Description of the FMU.
 
     Returns:
         The table, and the function that brings names into this form.

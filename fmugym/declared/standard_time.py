@@ -20,7 +20,7 @@ class StandardTime(NamedTuple):
 
     Attributes:
         offset: Its offset in seconds east of UTC; None if nothing tells it.
-        origin: What tells it.
+        origin: Source of the offset.
     """
 
     offset: int | None

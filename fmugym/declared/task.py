@@ -65,7 +65,7 @@ class Task:
     Two tasks are equal if they declare the same. Paths count as absolute paths.
 
     Attributes:
-        document: What it declares: dicts, lists, texts and numbers. Only a task that was made of a
+        document: Declarations: dicts, lists, texts and numbers. Only a task that was made of a
             dict may hold other objects.
         sources: The files that it was read from, the file itself first, or the dict.
         is_physical: Whether it is in its physical form; no file says so. See ``physical``.
@@ -136,7 +136,7 @@ class Task:
 
         Args:
             document: The dict. Distributions may also be objects such as ``Uniform(0, 1)``.
-            folder: Where relative paths start; by default the working directory.
+            folder: Base of relative paths; by default the working directory.
 
         Raises:
             ConfigError: For an unknown key, or as ``read`` for a file that it extends.

@@ -31,7 +31,7 @@ def described(root: Entry, master: str | None = None) -> tuple[Path | FMUSystem,
 
     Args:
         root: The table of all keys of the task.
-        master: Of a system, in the place of what its archive or the task says.
+        master: Master algorithm of a system, in the place of the one of its archive or of the task.
 
     Raises:
         ConfigError: If there is none; the text tells all mistakes that are known then.
@@ -55,7 +55,7 @@ def fmu_of(task: Task, master: str | None = None) -> Path | FMUSystem:
 
     Args:
         task: The task.
-        master: Of a system, in the place of what the archive or the file says.
+        master: Master algorithm of a system, in the place of the one in the archive or the file.
 
     Raises:
         ConfigError: If the task names none, or there is no bundled FMU of this name.

@@ -44,12 +44,12 @@ class TaskVariable:
 
     Attributes:
         alias: Its name in the task.
-        entry: Where it is declared or used first.
+        entry: Entry that declares or first uses the variable.
         in_fmu: The FMU's variable, with the bounds and the sampling of the task; None for an
             action that only expressions read.
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
-        limits: Those in the unit of the task; infinite where there are none.
+        limits: Limits in the unit of the task; infinite where there are none.
         nominal: The usual size of its values; None if neither the task nor the FMU says it.
         levels: The values that an action chooses from; empty for a continuous one.
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
@@ -188,9 +188,9 @@ class TaskVariables:
         """The variable of a name.
 
         Args:
-            entry: Where the name stands.
+            entry: Entry of the task.
             name: The name.
-            role: What it should name, for the error.
+            role: Role of the variable, for the error.
             others: More names to suggest.
 
         Raises:

@@ -58,7 +58,7 @@ class WarmUpControllers:
 
     Attributes:
         controllers: As given.
-        values: What they measure.
+        values: Measured values.
     """
 
     def __init__(self, naming: Naming, controllers: ControllerTable) -> None:

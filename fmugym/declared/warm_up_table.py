@@ -31,7 +31,7 @@ class WarmUpTable:
     """Declaration of the warm-up of a task.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         period: Its length in seconds.
         controllers: What acts on actions, by their aliases; others keep their start values. None if
             nothing acts.
@@ -64,7 +64,7 @@ def read_warm_up(
     Args:
         root: The task.
         actions: Its actions.
-        controlled: What is measured and its set point, in pairs, for a thermostat.
+        controlled: Pairs of a measured value and its set point, for a thermostat.
         name_of: Returns a name as it is declared.
     """
     known = root.child("controllers").items()

@@ -92,7 +92,7 @@ def read_weather(name: str, lines: Sequence[str]) -> DataTable:
     January of the next year.
 
     Args:
-        name: What the file is called.
+        name: Name of the file.
         lines: Its lines.
 
     Raises:
@@ -185,7 +185,7 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, DataTable]:
     ``CombiTimeTable``: its last row is at the time of the first one of the next period.
 
     Args:
-        name: What the file is called.
+        name: Name of the file.
         lines: Its lines; the first one is ``#1``.
 
     Raises:

@@ -115,7 +115,7 @@ def evaluate(
 
     Args:
         make_env: A function that makes the environment; see ``Player.make_env``.
-        players: Who acts, by name.
+        players: Players by name.
         seeds: The seeds of the episodes.
         most_steps: The steps after which an episode is stopped.
         scenario: The scenario that the environment plays, for the scores.
@@ -212,7 +212,7 @@ def warning_of_one_reward(scores: Sequence[Score]) -> str | None:
     """Say that a reward has never changed, so that there may be nothing to learn.
 
     Args:
-        scores: Those of one evaluation.
+        scores: Scores of one evaluation.
 
     Returns:
         A line of text; None if rewards differ, or so do the lengths of episodes with rewards.

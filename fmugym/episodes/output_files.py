@@ -58,7 +58,7 @@ class About:
 
     Attributes:
         facts: By name: the FMU, versions.
-        description: What the task is about.
+        description: Description of the task.
         text: The task, as its file has it.
     """
 

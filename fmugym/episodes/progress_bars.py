@@ -40,7 +40,7 @@ def progress_bar(total: float | None, what: str, unit: str = "steps") -> Iterato
     Args:
         total: The number of steps; None if it is not known.
         what: A word for what is done.
-        unit: What is counted; "" if only parts are shown.
+        unit: Name of the counted things; "" if only parts are shown.
     """
     if quiet.get() or not _is_watched():
         yield no_progress

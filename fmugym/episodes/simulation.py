@@ -72,7 +72,7 @@ class Summary:
 
     Attributes:
         seed: The seed of the episode.
-        steps: How many steps it had.
+        steps: Number of its steps.
         seconds: The simulated time.
         total_reward, total_cost: Sums over the episode; no cost if the task has none.
         end: ``"terminated"``, ``"truncated"``, or ``"fault: ..."`` with its reason.
@@ -199,7 +199,7 @@ def simulate(
     Args:
         env: An ``FMUEnv``, or a wrapper around one.
         policy: Chooses the actions.
-        seed: Of the episode, and of random actions.
+        seed: Seed of the episode, and of random actions.
         most_steps: The steps after which to stop. A registered id may have a lower limit, which
             truncates the episode.
         advance: Is told of each step.

@@ -43,7 +43,7 @@ class Decision:
         decide: Takes formulas: the elements of the observation, what the agent remembers, and a
             function that asks the network for its last values, or for any action if there is none.
             Returns the elements of the action, and what the agent remembers then.
-        starts: What it remembers at the beginning of an episode, by name.
+        starts: Memory at the beginning of an episode, by name.
     """
 
     network: Network | None = None

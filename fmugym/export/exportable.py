@@ -33,8 +33,8 @@ class ExportedAgent:
     """An agent of a task.
 
     Attributes:
-        name: What functions and files are called by.
-        logic: What surrounds the network.
+        name: Name of functions and files.
+        logic: Logic around the network.
         network: The network; None for none.
         notes: Lines that tell a reader what it is.
         units: The units of the plant by name.
@@ -71,7 +71,7 @@ def agent_of(
         model: An agent that a search has found, or its policy; a ``PID``, a ``Hysteresis`` or an
             ``LQR``; a model of Stable-Baselines3 or sb3-contrib; or a ``Network``.
         normalization: The ``VecNormalize`` of the training; None if there was none.
-        name: What functions and files are called by: letters, digits and _.
+        name: Name of functions and files: letters, digits and _.
         all_inputs: Whether the agent also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
         external: The names of data that the agent is given as measurements, forecasts of them

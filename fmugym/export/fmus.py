@@ -51,7 +51,7 @@ def write_fmu(
         agent: The agent. Its name is that of the model.
         path: The file, which must not exist.
         fmi_version: ``"2.0"`` or ``"3.0"``.
-        platforms: Of ``fmugym.export.building.PLATFORMS``; by default that of this machine.
+        platforms: Platforms of ``fmugym.export.building.PLATFORMS``; by default of this machine.
 
     Returns:
         The path.

@@ -84,13 +84,13 @@ class Logic:
 
     Attributes:
         graph: The operations.
-        loads: Where the values that it loads come from, by node.
+        loads: Sources of loaded values, by node.
         measurements: The plant's outputs that it reads.
         inputs: The plant's inputs that it writes.
         input_nodes: The node of each.
         features: The nodes of what the network takes; none if there is no network.
-        kept: What it keeps.
-        parameters: What was drawn in each episode.
+        kept: Kept values.
+        parameters: Drawn parameters of each episode.
         time_step: From one sample to the next, in seconds.
     """
 
@@ -183,8 +183,8 @@ class _Sample:
 
     Args:
         env: The environment.
-        formulas: Those of its task.
-        decision: What the agent computes.
+        formulas: Formulas of its task.
+        decision: Decision of the agent.
 
     Attributes:
         graph: The operations.

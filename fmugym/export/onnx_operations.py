@@ -166,7 +166,7 @@ class Operations:
         """Interpolate a value in a table, as ``numpy.interp`` does.
 
         Args:
-            number: Where to look.
+            number: Position in the table.
             table: The arguments, the values, and the values before the first and after the last.
         """
         count, nodes, x = len(table) // 2 - 1, self._nodes, self._value(number)

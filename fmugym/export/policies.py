@@ -30,7 +30,7 @@ def network_of_model(model: Any, normalization: Any = None) -> Network:
     """Read the deterministic policy of a model.
 
     Args:
-        model: Of Stable-Baselines3 or sb3-contrib, with a network of linear layers.
+        model: Model of Stable-Baselines3 or sb3-contrib, with a network of linear layers.
         normalization: A ``VecNormalize``, or None.
 
     Returns:

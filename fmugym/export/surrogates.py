@@ -29,8 +29,8 @@ def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit
 
     Args:
         surrogate: The surrogate.
-        name: What functions and files are called by: letters, digits and _.
-        units: Those of the FMU by name.
+        name: Name of functions and files: letters, digits and _.
+        units: Units of the FMU by name.
 
     Raises:
         ConfigError: If the name cannot be that of a file and a function of C.

@@ -53,7 +53,7 @@ class Graph:
         """The numbers of some nodes, and of all that they are computed from.
 
         Args:
-            numbers: Those of the nodes.
+            numbers: Numbers of the nodes.
             known: Nodes whose values are known, so that they need no others.
 
         Returns:

@@ -89,7 +89,7 @@ class Expression:
 
     Attributes:
         text: As the user wrote it.
-        tree: What it consists of.
+        tree: Syntax tree.
     """
 
     text: str
@@ -164,7 +164,7 @@ class Expression:
         """Make nodes of it.
 
         Args:
-            names: What the names stand for.
+            names: Values of the names.
 
         Raises:
             ConfigError: If a name is unknown, or the expression has something that is not in the
@@ -269,7 +269,7 @@ class _Evaluation:
 
     Args:
         text: The expression, for errors.
-        names: What names stand for.
+        names: Values of the names.
     """
 
     def __init__(self, text: str, names: Names) -> None:

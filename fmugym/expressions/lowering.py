@@ -50,7 +50,7 @@ def compile_graph(
 
     Args:
         graph: The operations.
-        stores: What to store, in this order.
+        stores: Values to store, in this order.
         results: The nodes of the results.
         seen: The number of arrays of observations.
 

@@ -72,7 +72,7 @@ class Value:
         Args:
             graph: Gets the node.
             name: A quantity, see ``QUANTITIES``; or an attribute of what functions are called with.
-            keys: What to index it with, one key after the other.
+            keys: Indices, one after the other.
             dtype: The type of the value, by default that of the quantity.
         """
         if dtype is None:

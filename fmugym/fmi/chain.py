@@ -32,8 +32,8 @@ def chained_jacobian(
         layout: The slots and routes of the system.
         differentiate: Differentiates one component of all instances at the present point.
         count: The number N of instances.
-        unknowns: What stands behind each variable to differentiate; the first end counts.
-        knowns: What stands behind each variable to differentiate by: one end or several.
+        unknowns: Ends of the variables to differentiate, in components; the first end counts.
+        knowns: Ends of the variables to differentiate by, in components: one or several.
 
     Returns:
         The partial derivatives, shape (N, len(unknowns), len(knowns)), in the units of the system.

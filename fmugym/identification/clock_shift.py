@@ -55,7 +55,7 @@ def shift_of_clocks(fit: FitResult, trajectories: Sequence[Trajectory]) -> Shift
 
     Args:
         fit: A fit whose residuals are no noise.
-        trajectories: What it was fitted to.
+        trajectories: Trajectories of the fit.
 
     Returns:
         The shift; None if there is none, or no input tells of it.

@@ -144,7 +144,7 @@ class FitResult:
 
         Args:
             count: How many.
-            seed: Of the draws.
+            seed: Seed of the draws.
 
         Returns:
             A row for each draw, in the order of ``values``, shape (count, k).

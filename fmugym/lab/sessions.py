@@ -56,7 +56,7 @@ class Session:
         token: The session or episode token.
         cell: The cell.
         began: When it began, in s of the lab's time.
-        length: How long it may last, in s.
+        length: Length in s.
         gym: The lease of an episode, or None.
         ended: Why it has ended, or None.
         is_stopped: Whether the user has stopped it.

@@ -73,7 +73,7 @@ def differentiate_by_starts(
 
     Args:
         envs: The environments; they return to their present episodes.
-        start: Of one environment, where the trajectory begins.
+        start: Start of one environment, where the trajectory begins.
         nominal: The actions, shape (horizon, ...).
         states: The start variable of each state.
         steps: How far states and actions are moved, as fractions.
@@ -278,7 +278,7 @@ def _slopes(before: FloatArray, after: FloatArray, widths: FloatArray) -> FloatA
     Args:
         before: The states before the step, shape (horizon, 2 (n_x + n_u), n_x); the first n_x pairs
             have moved states.
-        after: What follows, shape (horizon, 2 (n_x + n_u), k).
+        after: Next states, shape (horizon, 2 (n_x + n_u), k).
         widths: How far pairs of actions are apart, shape (horizon, n_u).
 
     Returns:

@@ -108,7 +108,7 @@ def linearize_along(
     Args:
         envs: The environments; their actions are in a box of floats. They return to their present
             episodes afterwards.
-        snapshot: Of one environment, where the trajectory begins.
+        snapshot: Snapshot of one environment, where the trajectory begins.
         actions: The nominal actions, shape (horizon, ...).
         states: Names of states; or the name of the start variable of each, such as
             ``{"q": "q_0"}``, where that is another one. The name of an array stands for its

@@ -19,10 +19,10 @@ class BackgroundLoop:
 
     Args:
         make: Makes the coroutine.
-        name: Of the thread.
+        name: Name of the thread.
 
     Attributes:
-        error: What the coroutine has raised, or None.
+        error: Exception of the coroutine, or None.
     """
 
     def __init__(self, make: Callable[[], Coroutine[Any, Any, None]], name: str) -> None:

@@ -50,7 +50,7 @@ class Feed:
     Attributes:
         plant: Has the tags; whoever makes the environment sets it.
         values: The present values of the tags, in the task's units.
-        faults: What is wrong, by the names of tags whose last value goes on.
+        faults: Faults by the names of tags whose last value goes on.
         has_expired: Whether the last value of one has held for too long.
         time: The plant's time at the present tick.
         jump: By how much the plant's time has jumped, in seconds.

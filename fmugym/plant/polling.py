@@ -50,7 +50,7 @@ class TagReading(NamedTuple):
 
     Attributes:
         numbers: In the unit of the task.
-        fault: What is wrong with them; "" if they are good.
+        fault: Fault of the numbers; "" for good ones.
     """
 
     numbers: tuple[float, ...]

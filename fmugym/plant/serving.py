@@ -54,7 +54,7 @@ class _Twin:
         plant: Has the tags.
         policy: Acts.
         clock: Tells the time.
-        seed: Of the episode.
+        seed: Seed of the episode.
         most: How many steps it has.
     """
 
@@ -164,14 +164,14 @@ class Server:
 
     Args:
         config: The task, as for ``fmugym.load``.
-        player: Who acts; or ``"random"``, or a controller as in a task file.
+        player: Player; or ``"random"``, or a controller as in a task file.
         port: The port; 0 for a free one.
         clock: Tells the time; by default that of the machine.
-        seed: Of the episode.
+        seed: Seed of the episode.
         steps: How many steps to serve; None for no end.
 
     Attributes:
-        address: Where it is served, as ``connect`` takes it.
+        address: Address of the server, as ``connect`` takes it.
         summary: Returns what was reached until now.
 
     Raises:

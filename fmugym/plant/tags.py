@@ -28,7 +28,7 @@ class Tag:
 
     Attributes:
         name: The name in the task.
-        entry: Where it is declared.
+        entry: Entry of the task.
         address: The keys of its address.
         conversion: From the plant's number to the unit of the task.
         count: How many numbers there are.
@@ -69,10 +69,10 @@ class Plant:
     """The section ``[plant]`` of a task.
 
     Attributes:
-        entry: Where it stands.
-        address: That of the server.
+        entry: Entry of the task.
+        address: Address of the server.
         tags: By name.
-        data: Where data come from while it runs, by their names in the task.
+        data: Sources of live data, by their names in the task.
         step: The time step of the task in seconds.
         poll, stale_after, hold: In seconds.
         standard: The offset of the task's standard time in seconds east of UTC; None if nothing

@@ -65,7 +65,7 @@ def fitted_surrogate(
     Args:
         make_env: Makes the environment, in the physical form of its task.
         steps: The steps of the FMU, at most.
-        seed: Of episodes and actions.
+        seed: Seed of episodes and actions.
         unseen: How many more episodes are played afterwards, for a test. Their steps do not count.
 
     Returns:
@@ -106,7 +106,7 @@ def excite(
     Args:
         evaluator: Its episodes are no longer than they shall be; its backend are the courses.
         courses: Keep what the FMU does.
-        probe: What is known of the task.
+        probe: Probe of the task.
         count: How many episodes there are.
         rng: Draws episodes and actions.
     """
@@ -146,7 +146,7 @@ class Excitation:
 
     Args:
         controller: The controller.
-        seed: Of the segments.
+        seed: Seed of the segments.
         episodes: The number of each environment's episode among those with this seed, shape (N,),
             so that episodes do not depend on how many environments step together.
     """

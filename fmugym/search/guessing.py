@@ -57,13 +57,13 @@ class Loops:
 
     Attributes:
         actions: Their names.
-        limits: Those of each action.
+        limits: Limits of each action.
         switches: The actions that are on or off.
         measured: The names of what is observed and measured.
-        setpoints: What a measured value may have to be, names or numbers, by its name.
+        setpoints: Possible set points, names or numbers, by measured value.
         widths: The ranges of what is observed, by name; infinite without limits.
-        time_step: That of the task in s.
-        most_steps: Those of an episode.
+        time_step: Time step of the task in s.
+        most_steps: Most steps of an episode.
     """
 
     actions: Sequence[str]
@@ -80,7 +80,7 @@ class Loops:
         """Find the control loops of a task.
 
         Args:
-            document: What it declares.
+            document: Declarations.
             env: Its environment in the physical form.
 
         Returns:
@@ -152,8 +152,8 @@ def suggested_controllers(
     """Test the plant of an evaluator by steps, and guess controllers; see ``guessed_controllers``.
 
     Args:
-        evaluator: Of a task.
-        loops: What the task tells.
+        evaluator: Evaluator of a task.
+        loops: Control loops of the task.
         most: The largest number of steps.
 
     Raises:
@@ -188,8 +188,8 @@ def guessed_controllers(loops: Loops, responses: StepResponses) -> dict[str, str
     """The controllers that step responses suggest: one for each action, paired by its gains.
 
     Args:
-        loops: What the task tells.
-        responses: What a test tells.
+        loops: Control loops of the task.
+        responses: Results of a step test.
 
     Returns:
         Texts for ``search_of`` by name, the least coupled pairing first. If there are several

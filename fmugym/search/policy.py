@@ -117,7 +117,7 @@ class ResidualAgent:
     Until they are found, the text has ranges in the places of numbers, or the weights are missing.
 
     Attributes:
-        name: What it is called.
+        name: Name of the agent.
         text: The controller, as ``controller_of`` or ``search_of`` reads it; None for the middle of
             the range.
         observed: The number of observations that the network sees; 0 for one that gives constants.
@@ -125,9 +125,9 @@ class ResidualAgent:
         hidden: The width of its hidden layer, which ends in a tanh; 0 for none.
         history: Whether it also sees the last change of each observation, its leaky integral, and
             the last action.
-        weights: Those of the network, shape (n,), or (N, n) with those of each environment.
+        weights: Weights of the network, shape (n,), or (N, n) with those of each environment.
         scale: Mean and divisor of each feature, shape (2, f).
-        names: What it observes; empty if that is not known yet.
+        names: Names of its observations; empty if that is not known yet.
         actions: The action space, in words.
     """
 
@@ -387,8 +387,8 @@ class ResidualPolicy(Controller):
 
         Args:
             observation: Its elements.
-            memory: What the network sees of the past, in the order of ``starts``.
-            base: What the controller has decided, the m elements of the action.
+            memory: Past values that the network sees, in the order of ``starts``.
+            base: Decision of the controller, the m elements of the action.
             network: Gives the m corrections, or the chosen elements, for some features.
 
         Returns:
@@ -458,9 +458,9 @@ def require_task(
     """Refuse a task other than the agent's.
 
     Args:
-        agent: What to call it.
+        agent: Name of the agent in messages.
         own: The names of what it observes, and what its actions are.
-        here: Those of the task.
+        here: Observations and actions of the task.
 
     Raises:
         ConfigError: With what differs.

@@ -54,7 +54,7 @@ class Probe:
         linear: The linear policy without a controller, whose weights are missing.
         agents: Controllers that the task declares and that do not plan ahead. Without any, those
             that suggest themselves, or else a constant action.
-        limits: What each cost may add up to in an episode.
+        limits: Limits of the costs of an episode.
         most_steps: The steps after which an episode is stopped.
         is_same: Whether all episodes are the same.
         seconds: Real time of a step of one environment among many.

@@ -80,7 +80,7 @@ def tuning_steps(most_steps: int | None, is_same: bool) -> int:
     """The steps until the numbers of a controller are found, at most, after the look at the task.
 
     Args:
-        most_steps: Those of an episode; None for no limit.
+        most_steps: Most steps of an episode; None for no limit.
         is_same: Whether all episodes are the same.
     """
     episodes, validated = (1, 1) if is_same else (_EPISODES, _VALIDATED)
@@ -93,20 +93,20 @@ class Search:
     """A search, which goes on round by round. Nothing in it depends on time.
 
     Args:
-        probe: What is known of the task.
-        seed: Of the candidates and of the episodes.
+        probe: Probe of the task.
+        seed: Seed of the candidates and of the episodes.
 
     Attributes:
         probe, seed: As given.
         episodes: How many each candidate plays in the first rounds.
-        rounds: How many there have been.
-        steps: Those of all environments until the search was last saved.
-        controllers: Those to be beaten.
+        rounds: Their number.
+        steps: Steps of all environments until the search was last saved.
+        controllers: Controllers to be beaten.
         baseline: The best one of them, once it is known.
         policies: The classes of policies, once they have entered.
         rng: Draws all random numbers.
-        scale: What observations are like; see ``scale_of``.
-        widths: Of the looks that are still to come, how many numbers each draws.
+        scale: Mean and scale of observations; see ``scale_of``.
+        widths: Number of draws in each of the probes that are still to come.
     """
 
     def __init__(self, probe: Probe, seed: int) -> None:

@@ -119,7 +119,7 @@ def search_in(content: bytes) -> Search:
     """The search that a file holds.
 
     Args:
-        content: That of the file.
+        content: Content of the file.
 
     Raises:
         Exception: Of any kind, if the file is damaged; see ``fmugym.errors.reading_file``.

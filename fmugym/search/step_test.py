@@ -56,7 +56,7 @@ class StepResponses:
     """Responses of k observations to steps of n actions.
 
     Attributes:
-        names: Of the observations.
+        names: Names of the observations.
         responses: Differences to the unstepped twins, beside the step as a part of the action's
             range: of each of the steps of each action in the first step of an episode, and the
             means of the quarters of an episode; NaN if it is too short. Shape (s, n, 5, k).
@@ -161,7 +161,7 @@ def step_test(
 
     Args:
         evaluator: Plays the episodes. They may be as long as ``evaluator.most_steps``.
-        limits: Those of each action.
+        limits: Limits of each action.
     """
     count, (low, high) = len(limits), np.array(limits).T
     unit = np.eye(count)

@@ -74,7 +74,7 @@ class _Panel:
     """A part of the picture with an axis of its own.
 
     Attributes:
-        label: What the axis shows.
+        label: Label of the axis.
         columns: The lines.
         setpoints: Set points of these.
         summed: Whether the lines are sums since the beginning of the episode.

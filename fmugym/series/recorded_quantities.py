@@ -80,7 +80,7 @@ class RecordedQuantities(NamedTuple):
         """Observations of M environments; no values if observations are no arrays.
 
         Args:
-            observations: Those of all environments.
+            observations: Observations of all environments.
             indices: The M environments.
 
         Returns:

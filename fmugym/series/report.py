@@ -92,9 +92,9 @@ def write_report(
 
     Args:
         path: A new file.
-        runs: What was recorded, by the name of the controller or agent. One is enough.
+        runs: Recorded episodes, by the name of the controller or agent. One is enough.
         title: The heading.
-        description: What the task is about.
+        description: Description of the task.
         facts: More to know, by name: the FMU, versions.
         text: The task, as its file has it.
         charts: More pictures, by their headings: SVG elements, as ``Figure.savefig`` of Matplotlib

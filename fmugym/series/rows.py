@@ -115,7 +115,7 @@ class RowMaker:
         indices: The environments to write down.
         every: The number of steps from one row to the next. Rewards and costs in a row are the sums
             since the row before.
-        infos: Those of the first reset, which tell the terms of rewards and costs.
+        infos: Infos of the first reset, which tell the terms of rewards and costs.
 
     Attributes:
         none: No rows, with the columns of all that follow.
@@ -174,7 +174,7 @@ class RowMaker:
         """Make the rows of a step.
 
         Args:
-            outcome: What the step has given.
+            outcome: Results of the step.
             idle: The environments that did not step.
         """
         terms = [outcome.infos.numbers(*path) for path in self._summed]

@@ -23,7 +23,7 @@ class EpisodeSummary:
 
     Attributes:
         environment, episode: Their numbers.
-        steps: How many steps it had.
+        steps: Number of its steps.
         seconds: The simulated time.
         reward: The total reward.
         figures: The totals of its terms and of costs, and the KPIs of the task, by their columns.

@@ -32,7 +32,7 @@ class TimeSeries:
             ``"flag"`` (terminated, truncated).
         values: Shape (rows, columns).
         faults: The reasons of faults by row.
-        cost_limits: What the costs of an episode may add up to, by name.
+        cost_limits: Limits of the costs of an episode, by name.
     """
 
     columns: tuple[Quantity, ...]

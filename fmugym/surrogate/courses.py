@@ -24,8 +24,8 @@ class Course(NamedTuple):
 
     Attributes:
         starts: The values set before initialization, shape (p,).
-        inputs: Those of T steps, shape (T, m).
-        outputs: Those at the start and after each step, shape (T + 1, k).
+        inputs: Inputs of T steps, shape (T, m).
+        outputs: Outputs at the start and after each step, shape (T + 1, k).
     """
 
     starts: FloatArray
@@ -42,9 +42,9 @@ class Courses:
     """Courses of an FMU; as the ``backend`` of environments, the object keeps their episodes.
 
     Attributes:
-        spec: What the pools do at each step; None before there is one.
-        variables: What is set before initialization, P of them.
-        steps: Those of all instances, warm-ups included.
+        spec: Specification of a step; None before there is one.
+        variables: P variables that are set before initialization.
+        steps: Steps of all instances, warm-ups included.
     """
 
     spec: PoolSpec | None = None
@@ -89,8 +89,8 @@ class RecordingPool(Pool):
 
     Args:
         pool: Steps the FMU.
-        spec: What it does at each step.
-        courses: Where they are kept.
+        spec: Specification of a step.
+        courses: Collection of the courses.
     """
 
     def __init__(self, pool: Pool, spec: PoolSpec, courses: Courses) -> None:

@@ -29,7 +29,7 @@ class Prediction(NamedTuple):
 
     Attributes:
         course: An episode of the FMU.
-        outputs: What the surrogate predicts of it from its beginning on, shape (T + 1, k).
+        outputs: Outputs that the surrogate predicts from its beginning on, shape (T + 1, k).
         errors: The root mean square error of predictions that begin everywhere in the episodes,
             by the number of their steps, shape (h, k).
         spread: The standard deviation of the outputs in the episodes, shape (k,).
@@ -46,7 +46,7 @@ def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
 
     Args:
         surrogate: The surrogate.
-        courses: Those of the FMU, each with a step at least; the longest one is shown.
+        courses: Courses of the FMU, each with a step at least; the longest one is shown.
     """
     terms, bounds = surrogate.terms, (surrogate.low, surrogate.high)
     longest = max(courses, key=lambda one: one.steps)

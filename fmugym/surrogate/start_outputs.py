@@ -26,9 +26,9 @@ class Start:
 
     Attributes:
         names: The variables that are set.
-        mean, deviation: What their values are like, shape (p,).
+        mean, deviation: Mean and standard deviation of their values, shape (p,).
         low, high: The range of the outputs, shape (k,).
-        weights: Those of the terms, shape (k, f).
+        weights: Weights of the terms, shape (k, f).
     """
 
     names: tuple[str, ...]

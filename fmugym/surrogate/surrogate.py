@@ -30,13 +30,13 @@ class Surrogate:
     Given as the ``backend`` of environments, it steps in the place of the FMU.
 
     Attributes:
-        terms: What the changes of outputs are sums of.
-        weights: Those of the terms, shape (k, f).
+        terms: Terms of the changes of outputs.
+        weights: Weights of the terms, shape (k, f).
         low, high: The range in which outputs stay, shape (k,).
         start: The outputs with which episodes begin.
-        error: That of simulations which the fit has not seen, beside the spread of the outputs.
-        spec: What the FMU did at each step.
-        variables: What was set before initialization, P of them.
+        error: Error of simulations which the fit has not seen, beside the spread of the outputs.
+        spec: Specification of a step.
+        variables: P variables that are set before initialization.
     """
 
     terms: Terms

@@ -33,11 +33,11 @@ class SurrogatePool(CountedPool):
     """N instances of a surrogate.
 
     Args:
-        terms: What a step depends on.
-        start: How episodes begin.
+        terms: Terms of the changes of outputs.
+        start: Outputs at the start of episodes.
         prepare: Makes a function that computes outputs; see ``Surrogate.runs``.
         fmu: Describes the variables; closed with the pool.
-        spec: What to do at each reset and step.
+        spec: Specification of a reset and step.
         num_instances: N.
     """
 

@@ -88,7 +88,7 @@ class Terms:
     Attributes:
         form: The form.
         widths: How many outputs and inputs there are.
-        mean, deviation, low, high: Those of what steps depend on, shape (d,).
+        mean, deviation, low, high: Statistics of the regressors, shape (d,).
         mixing: The weights in each tanh, and a constant, shape (tanhs, factors + 1).
         pairs: The factors of each product, shape (2, q).
     """
@@ -211,7 +211,7 @@ def simulated(
     """Simulate by numpy, from places in courses on.
 
     Args:
-        terms: What a step depends on.
+        terms: Terms of the changes of outputs.
         weights: Sets of weights, each of shape (f, k).
         bounds: Between what outputs stay, each of shape (k,).
         rows: As of ``regressors_of``, of n simulations, shape (d, n, steps): the first ones tell

@@ -84,7 +84,7 @@ class OpenComponent:
 
     Args:
         name: Its name in the system.
-        given: What the user gave.
+        given: Values that the user gave.
 
     Attributes:
         name, given: As given.

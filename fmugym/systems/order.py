@@ -57,10 +57,10 @@ def order_of(
         names: The components.
         links: The connections.
         told: The direct feed-through of each component.
-        loop: How algebraic loops are solved.
+        loop: Treatment of algebraic loops.
         unable: The components that cannot repeat a step. Their inputs in a loop count as given, so
             that only the rest of the loop is solved.
-        unable_at_start: Those for which the same holds at the start.
+        unable_at_start: Components for which the same holds at the start.
     """
     in_step = _chains(links, {name: one.in_step for name, one in told.items()})
     solvable, unsolved = _cut(in_step, links, unable)

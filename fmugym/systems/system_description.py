@@ -57,8 +57,8 @@ class SystemDescription(ModelDescription):
     Attributes:
         plan: The system.
         parts: The descriptions of the components.
-        ends: What stands behind each scalar and each element; one, except for connectors with
-            several ends.
+        ends: Variables of components behind each scalar and each element; one, except for
+            connectors with several ends.
     """
 
     plan: SystemPlan = _NO_PLAN

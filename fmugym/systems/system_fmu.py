@@ -22,7 +22,7 @@ class SystemFMU(FMU):
     """A system with the interface of an ``FMU``.
 
     Args:
-        plan: What to execute.
+        plan: Execution plan.
         probe_timeout: See ``FMU``.
 
     Attributes:

@@ -24,8 +24,8 @@ class PartLayout:
     """Inputs and outputs of one component that a step sets and gets.
 
     Attributes:
-        component: Of the plan.
-        description: Of its FMU.
+        component: Component of the plan.
+        description: Model description of its FMU.
         inputs, outputs: Its scalars and elements of arrays, one for each slot. Arrays are there as
             a whole, because FMI sets them as a whole.
         first_input, first_output: The numbers of its first slots.
@@ -68,7 +68,7 @@ class Route:
         source_part, target_part: Numbers of components.
         source, target: The first slots.
         count: How many slots follow each other: several for a whole array.
-        gain, offset, link: Those of the link, and its number.
+        gain, offset, link: Gain, offset and number of the link.
     """
 
     source_part: int
@@ -85,12 +85,12 @@ class SystemLayout:
     """The slots and routes of a system.
 
     Args:
-        description: Of the system.
+        description: Description of the system.
         inputs: The system's variables that each step sets.
         outputs: The system's variables that are read after each step.
 
     Attributes:
-        description, plan: Of the system.
+        description, plan: Description and plan of the system.
         parts: One for each component.
         routes: In the order of their targets.
 

@@ -65,7 +65,7 @@ class Wiring:
         definitions: Units of ``units``, and of FMUs that do not define them themselves.
 
     Attributes:
-        links: Those between components.
+        links: Links between components.
         connectors: The names of the system itself.
 
     Raises:

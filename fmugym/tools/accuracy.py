@@ -69,7 +69,7 @@ class Replay:
 
     Attributes:
         opening: Makes the pool.
-        variables: Those that are set at the start.
+        variables: Variables that are set at the start.
         starts: Their values, shape (P, 1).
         inputs: The values of the inputs in each step, shape (T, m).
     """
@@ -195,7 +195,7 @@ class Substeps:
 
     Attributes:
         needed: The least number that is exact enough; None if the results do not settle.
-        error: That of the task's own number of substeps.
+        error: Error of the task's own number of substeps.
         least: The difference of the two finest repetitions.
         finest: The largest number that was tried.
         seconds: The real time of a step by the number of substeps.

@@ -100,7 +100,7 @@ def data_as_text(facts: Mapping[str, Any]) -> Iterator[str]:
     """Format an overview of data for a terminal: each file once, with its columns below.
 
     Args:
-        facts: What ``overview_of_data`` returned.
+        facts: Result of ``overview_of_data``.
     """
     if not facts["series"] and facts["error"] is None:
         return

@@ -206,7 +206,7 @@ def players_of(arguments: argparse.Namespace, *, random: bool = False) -> dict[s
     """Make players by name, from the options of ``add_players``.
 
     Args:
-        arguments: Those of the command line.
+        arguments: Arguments of the command line.
         random: Whether random actions are among them in any case. They are if nobody else is.
 
     Raises:

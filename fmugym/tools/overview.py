@@ -163,7 +163,7 @@ def as_text(facts: Mapping[str, Any]) -> str:
     """Format an overview for a terminal.
 
     Args:
-        facts: What ``overview`` returned.
+        facts: Result of ``overview``.
 
     Returns:
         Lines of printable ASCII.
@@ -176,7 +176,7 @@ def tables(facts: Mapping[str, Any]) -> Iterator[str]:
     """Body of an overview: the trial, findings, variables, and the number of the others.
 
     Args:
-        facts: What ``overview`` returned.
+        facts: Result of ``overview``.
     """
     yield from (*_trial_lines(facts), *_findings(facts), *_tables(facts), *_not_listed(facts))
 

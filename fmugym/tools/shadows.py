@@ -48,7 +48,7 @@ def evaluate_log(
     Args:
         task: The task.
         log: The record of a shadow, whose times are seconds of the year.
-        players: Who acts on the FMU.
+        players: Players on the FMU.
         advance: Is told of each step on the FMU, as a part of all.
         leave_out: See ``evaluate``.
 

@@ -32,7 +32,7 @@ class SignalledEnd(KeyboardInterrupt):
     """A signal asks the program to end.
 
     Attributes:
-        number: That of the signal.
+        number: Number of the signal.
     """
 
     def __init__(self, number: int) -> None:

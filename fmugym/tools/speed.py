@@ -35,8 +35,8 @@ class Speed:
 
     Attributes:
         envs: How many; 0 stands for a single environment without vectors.
-        hooks: How hooks are called.
-        steps_per_second: Of all environments together, resets included.
+        hooks: Calls of the hooks.
+        steps_per_second: Steps per second of all environments together, resets included.
         microseconds: Real time of one call of ``step``.
         fmu_share: The part of it that the FMUs take by themselves; None if it cannot be measured.
     """
@@ -53,7 +53,7 @@ class SpeedReport:
     """The result of a measurement.
 
     Attributes:
-        speeds: Of a single environment, and of vector environments.
+        speeds: Speeds of a single environment, and of vector environments.
         time_step: The simulated seconds in a step.
         processors: How many this process may use.
         load: The mean number of running programs in the last minute; None if it is not known.

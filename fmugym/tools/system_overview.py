@@ -22,7 +22,7 @@ def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
 
     Args:
         path: The file.
-        master: Of a system, in the place of what the file says.
+        master: Master algorithm of a system, in the place of the one in the file.
 
     Raises:
         ConfigError: If the task file or the system has a mistake.
@@ -108,7 +108,7 @@ def as_text_of_system(facts: Mapping[str, Any]) -> str:
     """Format an overview of a system for a terminal.
 
     Args:
-        facts: What ``overview_of_system`` returned.
+        facts: Result of ``overview_of_system``.
 
     Returns:
         Lines of printable ASCII.

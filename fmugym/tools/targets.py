@@ -36,7 +36,7 @@ def maker_of(
     Args:
         target: The path of a task file, a registered id, or ``"module:Class"``.
         scenario: A scenario of the task file; None for any episodes.
-        master: Of a system, in the place of what its archive or task says.
+        master: Master algorithm of a system, in the place of the one of its archive or task.
         takes_fmu: Whether the path of an FMU or an SSP archive will do, too. It stands for the task
             that ``fmugym new`` proposes, whose reward is a guess that somebody has to look at.
 

@@ -26,7 +26,7 @@ def watched(
     Args:
         total: All that is to be done; None if that is not known.
         what: A word for it.
-        unit: What is counted; "" if only parts are shown.
+        unit: Name of the counted things; "" if only parts are shown.
         clock: Tells seconds; that of the system by default.
 
     Yields:

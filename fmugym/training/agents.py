@@ -121,10 +121,10 @@ class TrainedModel:
     """An agent of Stable-Baselines3, with the methods of a ``fmugym.baselines.Controller``.
 
     Args:
-        folder: Where it comes from, for errors.
+        folder: Folder of the agent, for errors.
         model: The model.
         normalization: Its ``VecNormalize``, or None.
-        facts: What ``save`` was told.
+        facts: Facts that ``save`` was given.
     """
 
     is_physical: Final = False
@@ -207,7 +207,7 @@ def read_facts(folder: Path, name: str, what_is_wrong: str, *needed: str) -> dic
     """Read a file of facts.
 
     Args:
-        folder: Where it is.
+        folder: Folder of the agent.
         name: Its name.
         what_is_wrong: What the error says of the folder.
         needed: The facts that must be there.

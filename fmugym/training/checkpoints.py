@@ -41,10 +41,10 @@ def save_checkpoint(folder: Path, model: Any, venv: Any, more: dict[str, Any]) -
     """Write a checkpoint; the one before stays until this one is complete.
 
     Args:
-        folder: That of the training.
+        folder: Folder of the training.
         model: The model of Stable-Baselines3.
         venv: Its environments: wrappers around a ``FMUVecEnv``.
-        more: What else to keep; it must be possible to pickle it.
+        more: Further objects to keep; it must be possible to pickle it.
     """
     place = _new_place(folder, int(model.num_timesteps))
     try:
@@ -129,7 +129,7 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
     Only load checkpoints from sources that you trust: the files hold pickles, which can run code.
 
     Args:
-        folder: That of the training.
+        folder: Folder of the training.
         algorithm: The name of the algorithm.
         venv: The same environments as before, which are brought to where they were.
 

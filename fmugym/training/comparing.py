@@ -27,7 +27,7 @@ def judge(
 
     Args:
         agents: By name.
-        evaluators: Those of the scenarios, by name; they are closed.
+        evaluators: Evaluators of the scenarios, by name; they are closed.
         episodes: How many episodes of each scenario.
         leave_out: Is told of an agent that cannot play to the end, or of a scenario that cannot be
             opened, by name and with the reason. The others play all the same.
@@ -79,8 +79,8 @@ def verdict(test: Mapping[str, Any], limits: Mapping[str, float]) -> str:
     """Describe the result in a line: the first agent beside the second one.
 
     Args:
-        test: What ``judge`` has returned.
-        limits: What each cost may add up to in an episode, by name.
+        test: Result of ``judge``.
+        limits: Limits of the costs of an episode, by name.
     """
     first, *others = test
     text = ", ".join(f"{name} {one['total_reward']:.6g}" for name, one in test.items())

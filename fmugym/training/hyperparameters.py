@@ -47,7 +47,7 @@ def tune_hyperparameters(
     own, ``trials/000`` and so on, and in a line of ``trials.csv``.
 
     Args:
-        settings: What to train. Arguments that it has are not searched for.
+        settings: Settings of the training. Arguments that it has are not searched for.
         trials: How many to make.
         steps: The steps of a trial.
         tell: Gets a line of text for each trial.

@@ -29,8 +29,8 @@ def write_outcome(settings: TrainingSettings, title: str, tell: Callable[[str], 
     Files that are there are replaced. Without Matplotlib there are none.
 
     Args:
-        settings: What was trained.
-        title: What the task is called.
+        settings: Settings of the training.
+        title: Title of the task.
         tell: Gets a line of text if Matplotlib is missing.
     """
     figure = write_curve(settings.folder, f"{title}, trained with {settings.algorithm}", tell)
@@ -42,7 +42,7 @@ def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
     """Draw the curve of a training.
 
     Args:
-        folder: That of the training. A picture that is there is replaced.
+        folder: Folder of the training. A picture that is there is replaced.
         title: A line of text above.
         tell: Gets a line of text if Matplotlib is missing.
 

@@ -34,7 +34,7 @@ def residual_facts(
 
     Args:
         make_env: Makes the environment; its task has the controller.
-        name: Of a controller of the task, or the text of one.
+        name: Name of a controller of the task, or the text of one.
         scale: The part of the range that is added to its action at most.
         tell: Gets lines of text.
 

@@ -82,14 +82,14 @@ class Searching:
     Attributes:
         make_env: Makes the environment, in the physical form of its task.
         scenarios: By name, functions that make the environments of the test.
-        folder: Where the agent is written; it must not exist, unless a search is resumed.
+        folder: Folder of the new agent; it must not exist, unless a search is resumed.
         minutes: Real time of all but the test; None for one minute, or no limit if there are
             rounds.
         rounds: The largest number of rounds, those of a resumed search included.
         steps: The largest number of steps of all environments together, in all but the test.
         envs: The largest number of environments that step together.
-        seed: Of candidates and episodes.
-        episodes: Of the test, in each scenario; None for the default.
+        seed: Seed of candidates and episodes.
+        episodes: Number of episodes of the test, in each scenario; None for the default.
         tell: Gets lines of text.
         advance: Is told after each round of the seconds since the last one, and of the scores.
         progress: Shows how far a part of the work is, of which it gets the seconds that it takes
@@ -404,7 +404,7 @@ class Searching:
 
         Args:
             baseline: The text of a controller.
-            episodes: Those of the test. Its first steps tell how long a step takes.
+            episodes: Number of episodes of the test. Its first steps tell how long a step takes.
         """
         for name, text in self._probe.task.get("controllers", {}).items():
             if not plans_ahead(text):

@@ -36,8 +36,8 @@ def tracker_for(kind: str, facts: Mapping[str, Any], folder: Path) -> Callable[[
 
     Args:
         kind: A key of ``TRACKERS``.
-        facts: What the run is: task, algorithm, arguments.
-        folder: That of the training, which is there when the run begins; its name is the run's.
+        facts: Facts about the run: task, algorithm, arguments.
+        folder: Folder of the training, which is there when the run begins; its name is the run's.
 
     Raises:
         ConfigError: If the library is missing.

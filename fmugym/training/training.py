@@ -76,18 +76,18 @@ class TrainingSettings:
     Attributes:
         make_env: A function that makes the environment.
         held_out: By name, functions that make the environments of evaluations.
-        folder: Where the agent is written; it must not exist, unless a training is resumed.
+        folder: Folder of the new agent; it must not exist, unless a training is resumed.
         algorithm: The name of a class of Stable-Baselines3 or sb3-contrib.
         steps: Steps of all environments together, at most.
         num_envs: Environments that step together.
-        seed: Of the environments and of the algorithm.
+        seed: Seed of the environments and of the algorithm.
         episodes: Episodes of an evaluation in each environment of ``held_out``.
         most_steps: The steps after which an episode of an evaluation is stopped.
         normalize: Whether observations and rewards are normalized by running statistics. Actions
             with other ranges are scaled to -1 to 1 in any case.
         arguments: Arguments of the algorithm.
         residual: Which controller's action it adds to, see ``residual_facts``; None for none.
-        records: What to record; None for nothing.
+        records: Settings of recordings; None for none.
     """
 
     make_env: Callable[..., FMUEnv]
@@ -169,11 +169,11 @@ def train(
     checkpoint from which the training can be resumed.
 
     Args:
-        settings: What to train.
+        settings: Settings of the training.
         resume: Whether to go on with the training in the folder. If the FMU's state can be saved or
             its steps repeated, all takes the same course as without the interruption, to the last
             bit.
-        watch: Who is told of the training.
+        watch: Listener of the training.
 
     Returns:
         The scores of the agent that is kept.

@@ -83,7 +83,7 @@ class TrainingRecords:
         """Make the wrapper of the training's environments.
 
         Args:
-            folder: That of the training. The file is made in the first step.
+            folder: Folder of the training. The file is made in the first step.
             begin: The steps that were done before.
         """
         name = f"training_from_{begin}" if begin else "training"
@@ -116,10 +116,10 @@ def append_row(
     """Add a row to a table of a training, which is made if there is none.
 
     Args:
-        folder: That of the training.
-        names: Those of the columns; in ``evaluations.csv`` steps and mean reward are the first.
+        folder: Folder of the training.
+        names: Names of the columns; in ``evaluations.csv`` steps and mean reward are the first.
         row: The values.
-        name: That of the file.
+        name: Name of the file.
     """
     path = folder / name
     before = path.read_text(encoding="utf-8") if path.exists() else ""

@@ -56,8 +56,8 @@ class Proof(NamedTuple):
 
     Attributes:
         agent: The agent.
-        seeds: Those of its episodes.
-        measured: What it has reached there.
+        seeds: Seeds of its episodes.
+        measured: Its result there.
     """
 
     agent: ResidualAgent
@@ -84,7 +84,7 @@ class TwinSearch:
     Attributes:
         found: The search.
         evaluator: The FMU's; its courses are kept.
-        courses: What the FMU has done.
+        courses: Courses of the FMU.
         steps: How many steps of the FMU there may be.
         seconds: The real time that is left.
         rounds: The largest number of rounds.

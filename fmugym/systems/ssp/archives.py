@@ -46,7 +46,7 @@ def system_arguments(path: str | os.PathLike[str], limits: ArchiveLimits | None)
 
     Args:
         path: The ``.ssp`` file.
-        limits: What is too large to be opened; None for the default.
+        limits: Limits of the size of an archive; None for the default.
 
     Raises:
         ConfigError: If a connection has a mistake.

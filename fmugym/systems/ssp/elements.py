@@ -158,7 +158,7 @@ def read_system(xml: Any, findings: list[str]) -> SystemElement:
 
     Args:
         xml: The element ``System``.
-        findings: What is ignored is added here.
+        findings: List to which ignored parts are added.
 
     Raises:
         FMULoadError: If it has something that would change results and cannot be used.

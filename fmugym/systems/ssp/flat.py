@@ -48,7 +48,7 @@ class Flat:
         root: The root system.
         units: The units that the file defines.
         description_of: Reads the model description of a component.
-        findings: What is ignored is added here.
+        findings: List to which ignored parts are added.
 
     Attributes:
         components: The components by path.
