@@ -132,7 +132,7 @@ class Controller(KnownArguments, ABC):
         """
         self._forget(np.ones(self.count, dtype=bool) if mask is None else np.asarray(mask))
 
-    # What a controller adds.
+    # Methods of each controller.
 
     def _prepare(self) -> None:
         """Find the needed elements of the space and of the names."""

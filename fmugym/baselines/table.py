@@ -103,7 +103,7 @@ class ControllerTable(Law):
             found |= dict.fromkeys([one for one in names if one not in read] if read else [text])
         return list(found)
 
-    # How entries depend on each other.
+    # Dependencies of entries.
 
     def _signal(self, name: str) -> str | None:
         """The signal of a name; None for the name of something else."""

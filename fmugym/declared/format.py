@@ -64,7 +64,7 @@ _MOST_NAMES: Final = 5000
 _NORMALIZATIONS: Final = ("limits", "nominal")
 
 
-# What single values may be.
+# Checks of single values.
 
 
 def _within(read: Callable[[str, Any], float], **limits: Any) -> Callable[[str, Any], float]:
@@ -612,7 +612,7 @@ SETPOINT: Final = Table(
 )
 
 
-# When episodes begin, and what acts before.
+# Beginnings of episodes, and warm-ups.
 
 
 SEASON: Final = Table(
@@ -681,7 +681,7 @@ WARM_UP: Final = Table(
 )
 
 
-# What is computed.
+# Computed values.
 
 
 def _named(**more: Key) -> Table:

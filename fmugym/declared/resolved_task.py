@@ -271,7 +271,7 @@ class ResolvedTask:
         values = self._terms(rewards)
         return any(values[n].constant is None or rewards[n].weight != 1.0 for n in rewards)
 
-    # Spaces, and what leads into and out of them.
+    # Spaces, and conversions of their values.
 
     def _hooks_of_spaces(self) -> dict[str, _Hook]:
         hooks: dict[str, _Hook] = {}
@@ -362,7 +362,7 @@ class ResolvedTask:
                 return normalized(seen, self._declared.nominal_of(seen.name))
         return seen
 
-    # What follows a step.
+    # After a step.
 
     def _make_formulas(self) -> Formulas:
         declared = self._declared

@@ -358,7 +358,7 @@ class _Assembly:
                 )
         return places
 
-    # What is kept.
+    # Kept values.
 
     def _add_fields(self, needed: set[int], places: list[int]) -> None:
         reads = self._reads(needed)

@@ -244,7 +244,7 @@ class _Perturbation:
         values = np.ascontiguousarray(np.concatenate([fixed, trials.states.T, times]))
         self._pool.reset(self._variables, values, trials.starts)
 
-    # What may be wrong
+    # Checks
 
     def _require_fine(self, what: str, indices: IndexArray) -> None:
         for index in indices[self._pool.statuses[indices] > WARNING_CODE].tolist():

@@ -218,7 +218,7 @@ class Search:
             if one.best:
                 one.merit = one.best.play(evaluator, self._seeds(VALIDATION)).merits[0]
 
-    # Who takes part.
+    # Candidates.
 
     def _candidate_search(
         self, agent: ResidualAgent, then: ResidualAgent | None = None
@@ -269,7 +269,7 @@ class Search:
             self.policies.append(self._candidate_search(*pair))
         self.policies.append(self._candidate_search(network))
 
-    # Who wins.
+    # The winner.
 
     def last_validation(self) -> tuple[list[ResidualAgent], range]:
         """Agents that would compete if the search ended now, and the seeds of the episodes.
