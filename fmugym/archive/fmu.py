@@ -250,7 +250,7 @@ class FMU(KnownArguments):
 
     @cached_property
     def feedthrough(self) -> Feedthrough:
-        """Which inputs act on which outputs at once, as the model description tells it.
+        """Direct feed-through: the inputs that act at once on each output, by the XML.
 
         Raises:
             FMULoadError: If the archive has been changed or removed.

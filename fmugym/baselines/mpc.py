@@ -325,7 +325,7 @@ class MPC(Controller):
         return episode
 
     def _measured(self, env: FMUEnv) -> npt.NDArray[np.bool_]:
-        """Which elements of the observation were measured now, and do not hold or lie ahead."""
+        """Mask of the observed elements that were measured now, and do not hold or lie ahead."""
         is_held = np.isin([*self._prototype.out], [*env.inside.held()])
         return np.asarray(self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1))
 

@@ -58,7 +58,7 @@ class DataRows:
 
     @cached_property
     def is_known(self) -> npt.NDArray[np.bool_]:
-        """Which rows have a time and a value, shape (n,)."""
+        """Mask of the rows with a time and a value, shape (n,)."""
         return ~np.isnan(self.times) & ~np.isnan(self.value.numbers)
 
     @property

@@ -57,7 +57,7 @@ _YEAR_OF_RULES: Final = 2025
 """The year whose winter and summer tell the standard time of a zone."""
 
 _MONTHS_OF_SPRING: Final = (3, 4, 9, 10, 11)
-"""When clocks are set forward, in the north and in the south."""
+"""Months in which clocks are set forward, in the north and in the south."""
 
 Told = Callable[[int], str]
 """Describes the place of a row by its index."""
@@ -304,7 +304,7 @@ def _runs(rows: IntArray) -> list[IntArray]:
 
 
 def _changes(zone: datetime.tzinfo, moments: IntArray) -> tuple[IntArray, IntArray]:
-    """When the offset of a zone changes near some moments, and the offsets before and after."""
+    """Changes of a zone's offset near some moments, with the offsets before and after."""
     near = np.unique(np.unique(moments // _DAY)[:, None] + np.arange(-2, 3))
     try:
         offsets = [_offset(zone, int(day) * _DAY) for day in near]

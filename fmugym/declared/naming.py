@@ -29,7 +29,7 @@ __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 
 
 class Moment(Enum):
-    """When an expression is evaluated."""
+    """Moment at which an expression is evaluated."""
 
     BEFORE = "before the FMU steps"
     AFTER = "after the FMU has stepped"

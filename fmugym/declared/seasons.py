@@ -36,7 +36,7 @@ class Scenario(NamedTuple):
     files: Mapping[str, int] = MappingProxyType({})
 
     def start_after(self, warm_up: float) -> float:
-        """When an FMU has to begin so that the scenario follows its warm-up, at least 0."""
+        """Start time of an FMU before the scenario's warm-up, at least 0."""
         return self.start - warm_up if self.start >= warm_up else (self.start - warm_up) % _YEAR
 
     def overlaps(self, start: float, length: float, files: Mapping[str, int]) -> bool:

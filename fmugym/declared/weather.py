@@ -141,7 +141,7 @@ def _offset(lines: Sequence[str]) -> int | None:
 
 
 def _end_of(date: Sequence[float], part: int, parts: int) -> float:
-    """When a record ends. Hour 1 is the first of a day; minutes mean several things in practice."""
+    """End of a record. Hour 1 is the first of a day; minutes mean several things in practice."""
     month, day, hour = map(int, date)
     if not 1 <= hour <= 24:
         raise ValueError(f"expected hours from 1 to 24, got {hour}")

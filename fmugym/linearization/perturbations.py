@@ -214,7 +214,7 @@ class _Perturbation:
         return trials, widths
 
     def _rounds(self, count: int) -> list[IndexArray]:
-        """Which trials the environments play one after the other."""
+        """Rounds of trials, which the environments play one after the other."""
         num_envs = len(self._everywhere)
         firsts = range(0, count, num_envs)
         return [np.minimum(np.arange(i, i + num_envs), count - 1) for i in firsts]

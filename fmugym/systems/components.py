@@ -154,7 +154,7 @@ class OpenComponent:
 
     @property
     def feedthrough(self) -> Feedthrough:
-        """Which inputs act on which outputs at once."""
+        """Direct feed-through: the inputs that act at once on each output."""
         told = self.fmu.feedthrough
         if self.given.feedthrough is None:
             return told

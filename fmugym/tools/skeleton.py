@@ -276,7 +276,7 @@ class Skeleton:
 
     @property
     def episode_steps(self) -> int:
-        """As many steps as the default experiment has, unless that is no episode."""
+        """Number of steps in the default experiment, unless that is no episode."""
         return round(self._duration / self.time_step) if self.has_duration else 200
 
     @property
