@@ -1,4 +1,4 @@
-"""What the C code needs to know before it opens a pool, as bytes.
+"""Forms that open a pool of the C extension, as bytes.
 
 ``NativePool`` hands the bytes to the C extension of this process, and ``ProcessPool`` to those of
 its workers. ``native/form.c`` reads all of them, in the same order.

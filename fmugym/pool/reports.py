@@ -1,4 +1,4 @@
-"""What the C code reports, in words: failures, refusals to load, and messages of FMUs."""
+"""Reports of the C code in words: failures, refusals to load, and messages of FMUs."""
 
 from __future__ import annotations
 

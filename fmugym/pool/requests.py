@@ -1,4 +1,4 @@
-"""What the engine is asked for besides steps, in this process or through a worker, and its answers.
+"""Requests to the engine besides steps, in this process or to a worker, and their answers.
 
 Both are forms; see ``fmugym.pool.form``. ``native/requests.c`` is the other end. A worker runs
 foreign code, so its answers may be anything. What does not fit the question is an error, which ends

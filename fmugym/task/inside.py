@@ -1,4 +1,4 @@
-"""What the other rooms of the package need of an environment."""
+"""Internal state of an environment, which other modules of the package read."""
 
 from __future__ import annotations
 

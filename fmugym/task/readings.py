@@ -1,4 +1,4 @@
-"""What hooks read: numbers for one environment, or arrays for N."""
+"""Readings of hooks: numbers for one environment, or arrays for N."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What makes the episode of a single environment, as columns of a snapshot."""
+"""Episode of a single environment as columns of a snapshot."""
 
 from __future__ import annotations
 

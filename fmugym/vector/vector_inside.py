@@ -1,4 +1,4 @@
-"""What other modules need of a vector environment."""
+"""Internal state of a vector environment, which other modules read."""
 
 from __future__ import annotations
 

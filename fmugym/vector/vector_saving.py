@@ -1,4 +1,4 @@
-"""What makes the episodes of a batch of environments, as columns of a snapshot."""
+"""Episodes of a batch of environments as columns of a snapshot."""
 
 from __future__ import annotations
 
