@@ -38,8 +38,8 @@ from fmugym.wine.installation import windows_path, windows_uri
 
 __all__ = [
     "BLANK",
+    "FLOAT64",
     "INTEGER",
-    "NUMBER",
     "START_TIME_TYPE",
     "Files",
     "Writer",
@@ -81,7 +81,7 @@ START_TIME_TYPE: Final = 255
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
-INTEGER, NUMBER = struct.Struct("=q"), struct.Struct("=d")
+INTEGER, FLOAT64 = struct.Struct("=q"), struct.Struct("=d")
 _CLOCK: Final = struct.Struct("=IIdqqdqqq")
 _CLOCKED: Final = struct.Struct("=III")
 _NO_CLOCK: Final = 2**32 - 1
@@ -119,7 +119,7 @@ class Writer:
 
     def numbers(self, *numbers: float) -> Self:
         """Write floating-point numbers."""
-        self._parts += [NUMBER.pack(number) for number in numbers]
+        self._parts += [FLOAT64.pack(number) for number in numbers]
         return self
 
     def optional(self, number: float | None) -> Self:

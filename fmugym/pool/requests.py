@@ -20,7 +20,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
-from fmugym.pool.form import BLANK, INTEGER, NUMBER, Writer
+from fmugym.pool.form import BLANK, FLOAT64, INTEGER, Writer
 from fmugym.pool.reports import Failure, describe_failure
 from fmugym.pool.spec import PoolSpec
 
@@ -110,7 +110,7 @@ class Reader:
 
     def number(self) -> float:
         """Read a floating-point number."""
-        return float(NUMBER.unpack(self._take(NUMBER.size))[0])
+        return float(FLOAT64.unpack(self._take(FLOAT64.size))[0])
 
     def block(self) -> bytes:
         """Read bytes with their size."""

@@ -15,7 +15,7 @@ from fmugym.pool import Pool
 from fmugym.pool.extension import needs_engine
 from fmugym.task.construction import Constructed
 from fmugym.task.plain import changed, plain_attributes
-from fmugym.task.snapshot import Column, Columns
+from fmugym.task.snapshot import Columns, SnapshotColumn
 
 __all__ = [
     "READ",
@@ -85,7 +85,7 @@ def note_attributes(env: Constructed) -> None:
     env.inside.as_constructed = plain_attributes(vars(env), env.inside.own_names)
 
 
-def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
+def read_columns(env: Constructed, column: Callable[[Any], SnapshotColumn]) -> Columns:
     """Copy what hooks read, of one environment or of several.
 
     Args:

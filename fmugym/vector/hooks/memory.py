@@ -17,13 +17,13 @@ from fmugym.task.readings import Readings
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.task_programs import TaskPrograms
 
-__all__ = ["Memory"]
+__all__ = ["StepArrays"]
 
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
 
 
-class Memory:
+class StepArrays:
     """The arrays of N environments that compiled steps read and write in place.
 
     Args:
