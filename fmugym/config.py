@@ -63,7 +63,7 @@ _INFOS: Final = frozenset(
 )
 """Keys that infos have of their own."""
 
-MOST_RETRIES: Final = 10
+_MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
 
 
@@ -180,7 +180,7 @@ _REMEMBERED: Final = Table(
 _NAMES: Final = Kind(
     _names, {"title": "name, list of names", "type": ["string", "array"], "items": TEXT.schema}
 )
-NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number", "minimum": 0})
+_NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number", "minimum": 0})
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ class Foreign(KnownArguments):
         "no limit",
     )
     licence_wait: float = key(
-        NOT_NEGATIVE,
+        _NOT_NEGATIVE,
         "Real seconds to wait for a licence that the FMU does not get. `0`: give up at once.",
         0.0,
     )
@@ -305,7 +305,7 @@ class EnvConfig:
     )
     substeps: int = key(COUNT, "Number of communication steps in one step.", 1)
     warm_up: float = key(
-        NOT_NEGATIVE,
+        _NOT_NEGATIVE,
         "Seconds simulated at each reset before the first observation, with the inputs at their "
         "start values; a multiple of `time_step`.",
         0.0,
@@ -381,8 +381,8 @@ class EnvConfig:
     on_fault: str = key(option(*ON_FAULT), "What a failed step does.", "truncate")
     fault_retries: int = key(
         Kind(
-            partial(check_integer, minimum=0, maximum=MOST_RETRIES),
-            {"type": "integer", "minimum": 0, "maximum": MOST_RETRIES},
+            partial(check_integer, minimum=0, maximum=_MOST_RETRIES),
+            {"type": "integer", "minimum": 0, "maximum": _MOST_RETRIES},
         ),
         "How often a step that the FMU discards is [repeated](reliability.md#retries), as 2, 4, "
         "8 ... smaller steps, before `on_fault` applies.",

@@ -37,7 +37,7 @@ __all__ = ["FMUVecEnv", "ResidualActions", "ScaledActions", "make_sb3_env"]
 
 
 Indices = int | Iterable[int] | None
-StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
+_StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
 
 _NOTHING_ENDED: dict[str, Any] = {"TimeLimit.truncated": False}
 """The info of a step after which the episode goes on."""
@@ -150,7 +150,7 @@ class FMUVecEnv(VecEnv):
         if self._overlap:
             self._outer.step_async(actions)
 
-    def step_wait(self) -> StepReturn:
+    def step_wait(self) -> _StepReturn:
         """Step all environments; an environment whose episode ends starts the next one.
 
         Returns:

@@ -54,7 +54,7 @@ So the rounding of times does not matter.
 """
 
 
-NO_NAMES: Final[Mapping[str, Value]] = {}
+_NO_NAMES: Final[Mapping[str, Value]] = {}
 
 _CHANNELS_OF_ACTUATORS: Final = 5_000
 _LONGEST_DELAY: Final = 2000
@@ -168,7 +168,7 @@ class Naming:
         entry: Entry,
         expression: Expression,
         moment: Moment,
-        others: Mapping[str, Value] = NO_NAMES,
+        others: Mapping[str, Value] = _NO_NAMES,
     ) -> Value:
         """Evaluate an expression.
 

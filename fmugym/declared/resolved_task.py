@@ -55,7 +55,7 @@ from fmugym.task.quantity import Quantities
 
 __all__ = ["ResolvedTask"]
 
-WORST: Final = "worst reward"
+_WORST: Final = "worst reward"
 """The episode variable with the lowest reward until now, or 0."""
 
 _LONG_AGO: Final = 1e9
@@ -408,7 +408,7 @@ class ResolvedTask:
         if not self._has_worst:
             return {}
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
-        return {WORST: minimum(self._naming.read("variables", WORST), reward)}
+        return {_WORST: minimum(self._naming.read("variables", _WORST), reward)}
 
     @cached_property
     def _updated_kpis(self) -> dict[str, Value]:
@@ -463,7 +463,7 @@ class ResolvedTask:
         if own.value is not None:
             return lambda env: env.config.fault_reward
         if self._has_worst:
-            return lambda env: env.variables[WORST]
+            return lambda env: env.variables[_WORST]
         reward = function_of(_sum(self._terms(self._declared.rewards)))
         return lambda env: min(0.0, reward(env))
 

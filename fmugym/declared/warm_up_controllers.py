@@ -29,7 +29,7 @@ __all__ = ["DeclaredWarmUp"]
 _Hook = Callable[[Any], Any]
 
 
-def variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
+def _variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
     """The episode variables that nodes read."""
     rows: list[Any] = [node.what for node in nodes if node.kind == "row"]
     found = (names[0] for attribute, *names in rows if attribute == "variables")
@@ -161,7 +161,7 @@ class DeclaredWarmUp(WarmUp):
         parts = [inputs, measured, *written.values()]
         roots = [value.node for part in (*parts, [naming.clock]) for value in part]
         needed = naming.graph.needed(roots)
-        self.depends_on = variables_in([naming.graph.nodes[number] for number in needed])
+        self.depends_on = _variables_in([naming.graph.nodes[number] for number in needed])
         told = None if table.controllers is None else table.controllers.told()
         content = repr((self.steps, self._time_step, told, _described(naming.graph, roots)))
         self.digest = sha256(content.encode()).hexdigest()

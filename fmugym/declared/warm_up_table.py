@@ -22,7 +22,7 @@ __all__ = ["WARM_UP_CLOCK", "WarmUpTable", "read_warm_up"]
 WARM_UP_CLOCK: Final = "clock"
 """Name of the time that schedules of a warm-up read; it is not rounded as measured values are."""
 
-THERMOSTATS: Final = ("thermostat", "hysteresis")
+_THERMOSTATS: Final = ("thermostat", "hysteresis")
 """The names of a controller whose arguments the task may tell."""
 
 
@@ -85,7 +85,7 @@ def read_warm_up(
             variable = _action_of(one, name, actions)
             controller: Any = (
                 _thermostat(one, variable, controlled)
-                if one.value in THERMOSTATS and one.value not in known
+                if one.value in _THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
             _rename(controller, name_of)

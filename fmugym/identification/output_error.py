@@ -37,10 +37,10 @@ from fmugym.pool.base import FloatArray
 
 __all__ = ["FitResult", "fit_of", "fit_parameters"]
 
-GUESS = 12.0
+_GUESS = 12.0
 """One over the variance of a uniform distribution, in units of its range."""
 
-MATTERS = 0.3
+_MATTERS = 0.3
 """Parts of a direction, which has the length 1, that are worth naming."""
 
 
@@ -132,9 +132,9 @@ class FitResult:
         scales = np.where(np.isfinite(widths), widths, np.abs([*self.values.values()]))
         told, directions = np.linalg.eigh(self.information * np.outer(scales, scales))
         return [
-            {n: float(x) for n, x in zip(self.values, along, strict=True) if abs(x) > MATTERS}
+            {n: float(x) for n, x in zip(self.values, along, strict=True) if abs(x) > _MATTERS}
             for amount, along in zip(told, directions.T, strict=True)
-            if amount < GUESS
+            if amount < _GUESS
         ]
 
     def rows(self, count: int, seed: int | None = 0) -> FloatArray:
@@ -160,7 +160,7 @@ class FitResult:
         for name, scale in zip(self.values, scales, strict=True):
             if not np.isfinite(scale):
                 raise ConfigError(f"{name!r} has no distribution: give it bounds")
-        told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, GUESS, 0.0))
+        told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, _GUESS, 0.0))
         amounts, directions = np.linalg.eigh(told)
         root = directions / np.sqrt(amounts)
         low, high = np.array([*self.bounds.values()]).T

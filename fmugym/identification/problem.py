@@ -35,25 +35,25 @@ __all__ = ["ParameterLimits", "Problem", "start_between"]
 
 ParameterLimits = float | tuple[float, float] | tuple[float, float, float]
 
-DIFFERENCE = 1e-6
+_DIFFERENCE = 1e-6
 """Step of the finite differences, as a fraction of a value's typical size."""
 
 FAILED = 1e3
 """Residual of a failed simulation, in units of the scale; it keeps the optimizer away."""
 
-MOST_EVALUATIONS = 100
+_MOST_EVALUATIONS = 100
 """Largest number of evaluations of an optimization."""
 
-MAX_ITERATIONS = 50
+_MAX_ITERATIONS = 50
 """Largest number of iterations in the fit of the initial states."""
 
-DESCENTS = 3
+_DESCENTS = 3
 """Of the candidates, as many of the best ones are starts of an optimization."""
 
-REWEIGHTINGS = 2
+_REWEIGHTINGS = 2
 """Number of times that outputs are weighted anew, by the noise of the residuals."""
 
-LEAST_NOISE = 1e-6
+_LEAST_NOISE = 1e-6
 """Of an output, as a part of its standard deviation."""
 
 
@@ -142,7 +142,7 @@ class Problem:
         starts, self._low, self._high = np.reshape(limits, (-1, 3)).T
         self.start = starts[:count]
         sizes = np.maximum(np.abs(starts), [v.nominal or 0.0 for v in variables])
-        self._differences = DIFFERENCE * np.where(sizes > 0.0, sizes, 1.0)
+        self._differences = _DIFFERENCE * np.where(sizes > 0.0, sizes, 1.0)
 
     def close(self) -> None:
         """Free the simulator."""
@@ -169,9 +169,9 @@ class Problem:
         found.sort(key=lambda one: one[0].cost)
         solution, self._states = found[0]
         spread, costs = self._scales, [float(one.cost) for one, _ in found]
-        for _ in range(0 if all(self._given) or len(self._given) == 1 else REWEIGHTINGS):
+        for _ in range(0 if all(self._given) or len(self._given) == 1 else _REWEIGHTINGS):
             noise = np.sqrt(np.mean(self._series(solution.fun) ** 2, axis=0)) * self._scales
-            noise = np.maximum(noise, LEAST_NOISE * spread)
+            noise = np.maximum(noise, _LEAST_NOISE * spread)
             self._scales = np.where(self._given, self._scales, noise)
             solution = self._descend(solution.x)
         return solution, costs
@@ -202,7 +202,7 @@ class Problem:
         strata = rng.permuted(np.tile(np.arange(candidates), (count, 1)), axis=1)
         points = low + (high - low) * (strata + rng.random(strata.shape)) / candidates
         points[:, 0] = self.start
-        return list(points[:, np.argsort(self._costs(points))[:DESCENTS]].T)
+        return list(points[:, np.argsort(self._costs(points))[:_DESCENTS]].T)
 
     def _costs(self, points: FloatArray) -> FloatArray:
         """The sums of squares at some points, shape (k, n), with the measured initial states."""
@@ -223,7 +223,7 @@ class Problem:
             jac=self._jacobian,
             bounds=(self._low[:count], self._high[:count]),
             x_scale="jac",
-            max_nfev=MOST_EVALUATIONS,
+            max_nfev=_MOST_EVALUATIONS,
         )
 
     def compare(self, parameters: FloatArray, *, refit: bool = True) -> Comparison:
@@ -371,7 +371,7 @@ def _levenberg_marquardt(
     """
     damping = np.full(states.shape[1], 1e-4)
     blocks = evaluate(states)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         steps = [block.step(factor) for block, factor in zip(blocks, damping, strict=True)]
         if all(block.is_solved(step) for block, step in zip(blocks, steps, strict=True)):
             break

@@ -16,7 +16,7 @@ from fmugym.pool.base import FloatArray
 
 __all__ = ["FEWEST", "StepResponses", "episodes_of", "step_test"]
 
-BoolArray = npt.NDArray[np.bool_]
+_BoolArray = npt.NDArray[np.bool_]
 
 _POINTS: Final = (0.25, 0.5, 0.75)
 """Operating points: all actions are at this part of their ranges."""
@@ -78,14 +78,14 @@ class StepResponses:
         return means.swapaxes(0, 1)
 
     @property
-    def _is_sure(self) -> BoolArray:
+    def _is_sure(self) -> _BoolArray:
         """Whether there is a response whose sign does not depend on the operating point."""
         last = np.nan_to_num(self.responses[:, :, -1])
         known = np.maximum(np.isfinite(self.responses[:, :, -1]).sum(axis=0), 1)
         magnitude = (np.abs(last).sum(axis=0) / known).T
         sizes = np.abs(self.ends).max(axis=0)[:, None]
         agrees = np.abs(self._means[-1]) >= _AGREEMENT * magnitude
-        sure: BoolArray = agrees & (magnitude > _NOTHING * sizes)
+        sure: _BoolArray = agrees & (magnitude > _NOTHING * sizes)
         return sure
 
     @property
@@ -118,10 +118,10 @@ class StepResponses:
         return [name for name, one in zip(self.names, away, strict=True) if one]
 
     @property
-    def is_instant(self) -> BoolArray:
+    def is_instant(self) -> _BoolArray:
         """Whether each observation follows an action at once and never after, shape (k,)."""
         first, last = np.abs(self._means[[0, -1]])
-        instant: BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
+        instant: _BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
         return instant
 
 

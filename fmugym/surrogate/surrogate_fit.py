@@ -145,7 +145,7 @@ class _Data:
         """The error of each penalty in the courses of one fold."""
         kept, left = self._split(number)
         terms, weights = self._weights(form, kept, _PENALTIES)
-        return simulation_errors(terms, weights, left, self.horizon, self)
+        return _simulation_errors(terms, weights, left, self.horizon, self)
 
     def _split(self, number: int) -> tuple[list[Course], list[Course]]:
         """Courses of a fit, and courses for its test."""
@@ -200,7 +200,7 @@ def _pieces(courses: Sequence[Course], steps: int) -> Iterator[Course]:
             yield Course(starts, inputs[begin : begin + steps], outputs[begin : begin + steps + 1])
 
 
-def simulation_errors(
+def _simulation_errors(
     terms: Terms, weights: Sequence[FloatArray], courses: Sequence[Course], horizon: int, data: Any
 ) -> FloatArray:
     """The root mean square error of outputs in simulations, for each set of weights.

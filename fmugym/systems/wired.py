@@ -30,9 +30,9 @@ from fmugym.systems.order import SystemOrder, order_of
 from fmugym.systems.system_plan import MASTERS, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
-__all__ = ["LOOPS", "SYSTEM", "WiredSystem"]
+__all__ = ["SYSTEM", "WiredSystem"]
 
-LOOPS: Final = ("newton", "refuse")
+_LOOPS: Final = ("newton", "refuse")
 """Treatments of algebraic loops."""
 
 
@@ -67,10 +67,10 @@ SYSTEM: Final = Table(
             MASTERS[0],
         ),
         "loops": Key(
-            option(*LOOPS),
+            option(*_LOOPS),
             "How [algebraic loops](systems.md#algebraic-loops) are solved, or that they are "
             "refused.",
-            LOOPS[0],
+            _LOOPS[0],
         ),
         "loop_tolerance": Key(
             POSITIVE,
@@ -100,7 +100,7 @@ class WiredSystem:
         name: str = "system",
         units: Mapping[str, str] | None = None,
         master: str = MASTERS[0],
-        loops: str = LOOPS[0],
+        loops: str = _LOOPS[0],
         loop_tolerance: float = Loop.tolerance,
         loop_iterations: int = Loop.max_iterations,
         step_size: float | None = None,

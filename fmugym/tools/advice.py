@@ -20,7 +20,7 @@ from fmugym.trial.known import known_verdict
 
 __all__ = ["advise"]
 
-ComplexArray = npt.NDArray[np.complex128]
+_ComplexArray = npt.NDArray[np.complex128]
 
 _STEPS_OF_AN_OSCILLATION: Final = 10
 _STEPS_OF_A_TIME_CONSTANT: Final = 5
@@ -170,7 +170,7 @@ def _time_step(replay: Replay) -> Advice | None:
     return Advice("", "time_step", step, f"{what}, where the FMU starts")
 
 
-def _eigenvalues(replay: Replay) -> ComplexArray | None:
+def _eigenvalues(replay: Replay) -> _ComplexArray | None:
     """Eigenvalues of the linear model at the start; None if the FMU gives none."""
     names = [variable.name for variable in replay.variables]
     starts = dict(zip(names, replay.starts[:, 0].tolist(), strict=True))
@@ -186,7 +186,7 @@ def _eigenvalues(replay: Replay) -> ComplexArray | None:
         own.close()
 
 
-def _longest(eigenvalues: ComplexArray) -> Iterator[tuple[float, str]]:
+def _longest(eigenvalues: _ComplexArray) -> Iterator[tuple[float, str]]:
     """Limits of the time step, and the reason for each."""
     rates, waves = np.abs(eigenvalues.real), np.abs(eigenvalues.imag)
     swings = waves[waves > rates]

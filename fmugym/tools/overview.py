@@ -21,7 +21,7 @@ from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "finite_or_none", "headed", "overview", "tables", "typed_start"]
 
-SHOWN: Final = ("input", "output", "parameter")
+_SHOWN: Final = ("input", "output", "parameter")
 """The causalities that are listed by default."""
 
 _HEADINGS: Final = {
@@ -43,7 +43,7 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
 
     Args:
         fmu: The FMU.
-        everything: List variables of all causalities, not only those in ``SHOWN``.
+        everything: List variables of all causalities, not only those in ``_SHOWN``.
         pattern: List the variables of all causalities whose name matches. ``*`` matches any text
             and ``?`` one character; brackets match themselves, since names of arrays have them.
 
@@ -121,7 +121,7 @@ _TIMES: Final = ("start_time", "stop_time", "step_size", "tolerance")
 
 def _is_wanted(variable: Variable, everything: bool, pattern: str | None) -> bool:
     if pattern is None:
-        return everything or variable.causality in SHOWN
+        return everything or variable.causality in _SHOWN
     return matches(pattern, variable.name)
 
 

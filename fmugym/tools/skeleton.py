@@ -36,16 +36,16 @@ __all__ = [
     "rounded_down",
 ]
 
-MOST_PARAMETERS: Final = 40
+_MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
 
-DEFAULT_STEP: Final = 0.01
+_DEFAULT_STEP: Final = 0.01
 """Step size in seconds for an FMU without a default experiment."""
 
 _MOST_ELEMENTS: Final = 100
 """Larger arrays are left out."""
 
-MOST_LOCALS: Final = 8
+_MOST_LOCALS: Final = 8
 """Most locals that stand for the outputs of an FMU without any."""
 
 _EPISODE_STEPS: Final = 500
@@ -153,16 +153,16 @@ class Skeleton:
     @cached_property
     def outputs(self) -> list[Variable]:
         """The numeric outputs, or some locals if there are none."""
-        return _scalars(self._of("output")) or _scalars(self._of("local"))[:MOST_LOCALS]
+        return _scalars(self._of("output")) or _scalars(self._of("local"))[:_MOST_LOCALS]
 
     @cached_property
     def parameters(self) -> list[Variable]:
         """The parameters of the model that can be set and have a start value.
 
-        At most ``MOST_PARAMETERS``. Those of the exporter's solver are left out.
+        At most ``_MOST_PARAMETERS``. Those of the exporter's solver are left out.
         """
         usable = (v for v in self._of("parameter") if v.settable_at_start and literal(v))
-        return [v for v in usable if not _SOLVER.search(v.name)][:MOST_PARAMETERS]
+        return [v for v in usable if not _SOLVER.search(v.name)][:_MOST_PARAMETERS]
 
     @property
     def left_out(self) -> int:
@@ -312,7 +312,7 @@ class Skeleton:
         """A round number of seconds, or a multiple of the FMU's internal step size."""
         internal = self._description.fixed_internal_step_size
         if not 0.0 < self._duration < math.inf:
-            return internal or DEFAULT_STEP
+            return internal or _DEFAULT_STEP
         if internal:
             return internal * max(1, round(self._duration / _EPISODE_STEPS / internal))
         return rounded_down(self._duration / _EPISODE_STEPS)

@@ -13,7 +13,6 @@ from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.errors import FMULoadError, shown
 
 __all__ = [
-    "FMU_TYPE",
     "SSD",
     "Element",
     "OwnConnector",
@@ -31,7 +30,7 @@ __all__ = [
 SSD: Final = "SystemStructure.ssd"
 """The file of an archive that describes its system."""
 
-FMU_TYPE: Final = "application/x-fmu-sharedlibrary"
+_FMU_TYPE: Final = "application/x-fmu-sharedlibrary"
 
 _GIVES: Final = {"output", "calculatedParameter", "local", "constant"}
 _INTERFACES: Final = {
@@ -202,11 +201,11 @@ def ignored(root: Any) -> list[str]:
 
 
 def _read_component(xml: Any, findings: list[str]) -> Element:
-    name, kind = xml.get("name"), xml.get("type") or FMU_TYPE
-    if kind != FMU_TYPE:
+    name, kind = xml.get("name"), xml.get("type") or _FMU_TYPE
+    if kind != _FMU_TYPE:
         raise FMULoadError(
             f"line {xml.sourceline}: the component {shown(name)} is of type {shown(kind)}, "
-            f"expected {FMU_TYPE!r}"
+            f"expected {_FMU_TYPE!r}"
         )
     wanted = xml.get("implementation")
     if wanted not in _INTERFACES:
