@@ -94,7 +94,7 @@ class TestPendulum:
     def test_it_shows_how_far_it_is(self, ran, task, tmp_path, monkeypatch):
         counts = []
         shown = contextmanager(lambda total, what, unit: iter([counts.append]))
-        monkeypatch.setattr("fmugym.tools.fitting.progress", shown)
+        monkeypatch.setattr("fmugym.tools.fitting.progress_bar", shown)
         log = write_log(tmp_path / "log.csv")
         ran("fit", task, "--log", log, *NAMES, *START, "--candidates", 5)
         assert counts[0] == 1
