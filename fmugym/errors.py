@@ -1,4 +1,4 @@
-"""Errors of fmugym.
+"""Exceptions of fmugym.
 
 ::
 

@@ -60,7 +60,7 @@ _ELEMENTS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExc
 
 
 def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescription:
-    """Make a model description.
+    """Convert FMPy's model description to a ``ModelDescription``.
 
     Args:
         source: Model description as FMPy reads it.

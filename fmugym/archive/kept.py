@@ -137,7 +137,7 @@ def _template_of(shared: dict[str, Any]) -> Variable:
 
 
 def _time_of(time: Sequence[Any]) -> Interval:
-    """A time of a clock. One that only the FMU knows is always the same object."""
+    """Read a time of a clock; ``UNKNOWN`` for one that only the FMU knows."""
     made = Interval(*time)
     return UNKNOWN if math.isnan(made.seconds) else made
 

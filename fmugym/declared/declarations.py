@@ -1,4 +1,4 @@
-"""The sections of a task, read and checked against the FMU."""
+"""Sections of a task, read and checked against the FMU."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _ASSIGNMENT: Final = re.compile(rf"\s*({_KEYS})\s*=")
 
 
 class Source(NamedTuple):
-    """A file, or a dict of the caller, that gives values of a task.
+    """Source of a task's values: a file, or a dict of the caller.
 
     Attributes:
         path: The file; None for a dict.

@@ -229,7 +229,7 @@ def _lie_within(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True)
 class Misreading:
-    """A variable without a unit that the FMU seems to mean in another one than the task.
+    """Suspicion that the FMU means a variable in another unit than the task.
 
     Attributes:
         name: Its name in the task.

@@ -58,7 +58,7 @@ class Mistakes:
         return [keys[0] for keys in self._unknown if len(keys) == 1]
 
     def explain(self, keys: _Keys) -> bool:
-        """Whether a mistake may be the reason why there is no value under these keys.
+        """Whether a noted mistake may be the reason for a missing value under these keys.
 
         It is in the value, in the table that should have it, or in the name of a key of the table.
         """

@@ -343,7 +343,7 @@ class ResidualPolicy(Controller):
         return np.stack(self._step(rows, base), axis=-1)
 
     def _step(self, observed: FloatArray, base: FloatArray) -> list[Any]:
-        """Elements of the action; ``corrected`` has the same in formulas."""
+        """Compute the action, as the formulas of ``corrected`` do, and update the memory."""
         if not self.agent.acting:
             return [*base]
         features = observed[:, : self.agent.observed]

@@ -57,7 +57,7 @@ class Infos(NamedTuple):
 
 
 def batched_info(info: Mapping[str, Any]) -> dict[str, Any]:
-    """The info of a single environment, as a vector environment of one gives it."""
+    """Convert the info of a single environment to the infos of a vector environment of one."""
     values = {
         n: batched_info(one) if isinstance(one, Mapping) else [one] for n, one in info.items()
     }

@@ -137,7 +137,7 @@ def _row(variable: Variable) -> dict[str, Any]:
 
 
 def finite_or_none(number: float) -> float | None:
-    """JSON has no infinities."""
+    """Return a finite number; None for infinity and NaN, which JSON lacks."""
     return number if math.isfinite(number) else None
 
 
