@@ -22,7 +22,7 @@ from fmugym import FMU, bundled_fmu
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
+from fmugym.systems.system_plan import MASTERS, ComponentPlan, Evaluation, Group, Link, SystemPlan
 
 __all__ = ["tables"]
 
@@ -149,7 +149,7 @@ def _pass_on(model: Model, pools: Sequence[Pool]) -> None:
 def _system(stack: ExitStack, model: Model, master: str, count: int) -> Pool:
     plan = SystemPlan(
         model.name,
-        tuple(Component(name, model.path) for name in NAMES),
+        tuple(ComponentPlan(name, model.path) for name in NAMES),
         tuple(Link(*link) for link in model.links),
         tuple(Group((name,)) for name in NAMES),
         tuple(Evaluation((index,)) for index in range(len(model.links))),

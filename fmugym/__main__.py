@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from fmugym.tools.ending import end_as_after_ctrl_c, exit_code
+from fmugym.tools.signal_handling import end_as_after_ctrl_c, exit_code
 
 __all__ = ["main"]
 
@@ -20,7 +20,7 @@ def main() -> int:
         sys.path.append("")  # module:Class may be in the working directory
         from fmugym.tools import cli
 
-        return cli.main()
+        return cli.run_command_line()
     except KeyboardInterrupt as error:
         return exit_code(error)
 

@@ -1,4 +1,4 @@
-"""Where this package keeps files that last between runs."""
+"""Folders for files that last between runs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def cache_folder(*names: str) -> Path:
     Windows ``LOCALAPPDATA``. A folder that is missing is made.
 
     Args:
-        names: Of a folder in it.
+        names: Names on the path to a folder in it.
 
     Raises:
         OSError: If there can be none, or others may write to it.
@@ -56,7 +56,7 @@ def cache_folder(*names: str) -> Path:
 
 
 def lasting_folder(*names: str) -> Path:
-    """As ``cache_folder``; where there can be none, in the user's own one for temporary files.
+    """Cache folder; if there can be none, the user's own folder for temporary files.
 
     Raises:
         OSError: If there can be none there either.
@@ -103,13 +103,13 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def own_prefix() -> str:
-    """How the names of temporary files and folders of this process begin."""
+    """Beginning of the names of temporary files and folders of this process."""
     return f"fmugym-{os.getpid()}-{_namespace()}-"
 
 
 @functools.cache
 def sweep(folder: Path) -> None:
-    """Remove from a folder what killed processes of this user have left; once in a process."""
+    """Remove the remains of this user's killed processes from a folder; once in a process."""
     for path in folder.glob("fmugym-*"):
         name = _NAME.fullmatch(path.name)
         if name and int(name["namespace"]) == _namespace() and not _is_alive(int(name["pid"])):
@@ -156,7 +156,7 @@ def _user() -> int:
 
 
 def _private(root: Path, names: tuple[str, ...]) -> Path:
-    """Make a folder and those in it, each for this user alone."""
+    """Make a folder and its missing parents, each for this user alone."""
     for folder in accumulate(names, Path.joinpath, initial=root):
         folder.mkdir(0o700, parents=True, exist_ok=True)
         others = sys.platform != "win32" and folder.stat().st_mode & _OTHERS

@@ -261,7 +261,7 @@ def check_text(what: str, value: Any) -> str:
 
 
 def check_option(kind: str, value: Any, known: Iterable[str]) -> str:
-    """Return a value that is one of some texts.
+    """Return a value if it is one of some texts.
 
     Raises:
         ConfigError: With the nearest of them.
@@ -336,7 +336,7 @@ class Spellings:
     Names count as equal if their normal forms NFKC are, as in Python. An exact name wins.
 
     Args:
-        kind: What the names name, for the error.
+        kind: Kind of the named things, for the error.
         names: The names.
     """
 
@@ -385,10 +385,10 @@ class Spellings:
 def by_own_names(
     what: str, given: Mapping[str, _Value], own_name: Callable[[str], str]
 ) -> dict[str, _Value]:
-    """What is given by names, by the own names of what these stand for.
+    """Resolve the names of a dict to the own names of the named things.
 
     Args:
-        what: What is given, for the error.
+        what: Name of the given thing, for the error.
         given: Values by name.
         own_name: Finds the own name for a given one.
 
@@ -433,8 +433,8 @@ def parts_of_array(name: str, shape: tuple[int, ...], value: Any) -> list[Any]:
     """Give each element of an array its part of a value.
 
     Args:
-        name: That of the array, for the error.
-        shape: Of the array.
+        name: Name of the array, for the error.
+        shape: Shape of the array.
         value: Nested lists of this shape, a flat list in row-major order, or one value for all.
 
     Raises:

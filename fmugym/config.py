@@ -1,4 +1,4 @@
-"""The config of an environment: a dict as the user writes it, checked once and frozen."""
+"""Config of an environment: a dict of the user, checked once and frozen."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ from fmugym.keys import (
     Listed,
     Table,
     check_fields,
-    checked,
+    checked_entry,
     key,
     option,
     or_none,
-    table_of,
+    table_of_fields,
 )
 from fmugym.pool.spec import (
     DEFAULT_CALL_TIMEOUT,
@@ -61,9 +61,9 @@ ON_FAULT: Final = ("truncate", "terminate", "raise")
 _INFOS: Final = frozenset(
     {"cost", "costs", "drawn", "fault", "fault_rate", "fmu_terminated", "reward_terms"}
 )
-"""What infos have of their own."""
+"""Keys that infos have of their own."""
 
-MOST_RETRIES: Final = 10
+_MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
 
 
@@ -156,7 +156,7 @@ def _expression(what: str, value: Any) -> Expression:
 _EXPRESSION: Final = {"title": "expression", "type": ["number", "string", "boolean"]}
 
 EXPRESSION: Final = Kind(lambda _, value: Expression.parse(value), _EXPRESSION)
-"""An expression where the caller says in which key it stands."""
+"""Kind of an expression; the caller adds its key to messages."""
 
 _NAMED_EXPRESSION: Final = Kind(_expression, _EXPRESSION)
 
@@ -177,15 +177,15 @@ _REMEMBERED: Final = Table(
     what="key of 'memory'",
 )
 
-NAMES: Final = Kind(
+_NAMES: Final = Kind(
     _names, {"title": "name, list of names", "type": ["string", "array"], "items": TEXT.schema}
 )
-NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number", "minimum": 0})
+_NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number", "minimum": 0})
 
 
 @dataclass(frozen=True)
 class Foreign(KnownArguments):
-    """How an FMU of unknown quality is opened and run; see ``docs/foreign.md`` for the keys.
+    """Settings for an FMU of unknown quality; see ``docs/foreign.md`` for the keys.
 
     Raises:
         ConfigError: For values of the wrong type or range; it names all of them.
@@ -224,18 +224,18 @@ class Foreign(KnownArguments):
         "no limit",
     )
     licence_wait: float = key(
-        NOT_NEGATIVE,
+        _NOT_NEGATIVE,
         "Real seconds to wait for a licence that the FMU does not get. `0`: give up at once.",
         0.0,
     )
     preload: tuple[str, ...] = key(
-        Kind(_names, NAMES.schema, "libraries"),
+        Kind(_names, _NAMES.schema, "libraries"),
         "Shared libraries that are [loaded before](foreign-fmus.md#missing-libraries) "
         "the FMU's own. A relative path is relative to the file of the class or of the task.",
         (),
     )
     archive_limits: ArchiveLimits | None = key(
-        table_of(ArchiveLimits, what="archive limit", make=ArchiveLimits),
+        table_of_fields(ArchiveLimits, what="archive limit", make=ArchiveLimits),
         "The [largest FMU](reliability.md#archive-limits) that is opened, as a dict or a "
         "`fmugym.archive.ArchiveLimits`.",
         None,
@@ -246,13 +246,13 @@ class Foreign(KnownArguments):
         check_fields(self)
 
 
-FOREIGN: Final = table_of(Foreign, what="key of 'foreign'", make=Foreign)
+FOREIGN: Final = table_of_fields(Foreign, what="key of 'foreign'", make=Foreign)
 """The keys of ``Foreign``."""
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """How an environment drives its FMU. All times are in simulated seconds.
+    """Config of an environment. All times are in simulated seconds.
 
     Numbers may be given in any type; the attributes are Python floats and integers. Attributes are
     the keys of a config; ``docs/config.md`` lists them.
@@ -262,11 +262,13 @@ class EnvConfig:
     """
 
     model_input_names: tuple[str, ...] = key(
-        NAMES,
+        _NAMES,
         "Variables to which the action is written: inputs or tunable parameters. "
         "[Arrays](fmi.md#arrays) go by their name, or by elements as `v[3]`.",
     )
-    model_output_names: tuple[str, ...] = key(NAMES, "Variables that `state` holds, in this order.")
+    model_output_names: tuple[str, ...] = key(
+        _NAMES, "Variables that `state` holds, in this order."
+    )
     model_parameters: Mapping[str, Any] = key(
         Entries(Kind(as_distribution)),
         "Start values and parameters by name: numbers or [distributions](config.md#distributions). "
@@ -303,13 +305,13 @@ class EnvConfig:
     )
     substeps: int = key(COUNT, "Number of communication steps in one step.", 1)
     warm_up: float = key(
-        NOT_NEGATIVE,
+        _NOT_NEGATIVE,
         "Seconds simulated at each reset before the first observation, with the inputs at their "
         "start values; a multiple of `time_step`.",
         0.0,
     )
     monitor_names: tuple[str, ...] = key(
-        NAMES,
+        _NAMES,
         "Variables that are read along with the outputs: in `out`, not in `state`.",
         (),
     )
@@ -379,8 +381,8 @@ class EnvConfig:
     on_fault: str = key(option(*ON_FAULT), "What a failed step does.", "truncate")
     fault_retries: int = key(
         Kind(
-            partial(check_integer, minimum=0, maximum=MOST_RETRIES),
-            {"type": "integer", "minimum": 0, "maximum": MOST_RETRIES},
+            partial(check_integer, minimum=0, maximum=_MOST_RETRIES),
+            {"type": "integer", "minimum": 0, "maximum": _MOST_RETRIES},
         ),
         "How often a step that the FMU discards is [repeated](reliability.md#retries), as 2, 4, "
         "8 ... smaller steps, before `on_fault` applies.",
@@ -447,7 +449,7 @@ class EnvConfig:
         for name in ("positive_reward", "negative_reward"):
             if name in given and given.get("reward") is not None:
                 raise ConfigError(f"config keys 'reward' and {name!r} contradict each other")
-        return cls(**checked(CONFIG, given))
+        return cls(**checked_entry(CONFIG, given))
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -455,7 +457,7 @@ class EnvConfig:
 
     @property
     def variable_starts(self) -> dict[str, Any]:
-        """What episode variables are at the beginning of an episode, the memory among them."""
+        """Start values of episode variables, the memory among them."""
         return {name: one["start"] for name, one in self.memory.items()} | dict(
             self.episode_variables
         )
@@ -517,7 +519,7 @@ class EnvConfig:
             )
 
 
-CONFIG: Final = table_of(
+CONFIG: Final = table_of_fields(
     EnvConfig,
     what="config key",
     elsewhere={

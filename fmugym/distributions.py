@@ -1,4 +1,4 @@
-"""Distributions from which an environment draws values at each reset.
+"""Distributions of start values and parameters, which an environment draws at each reset.
 
 Wherever a config takes a number for a start value, a parameter or an episode variable, it also
 takes a distribution. The environment then draws from it with its own seeded generator.
@@ -31,8 +31,8 @@ from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
     "Choice",
-    "Column",
     "Distribution",
+    "DrawnColumn",
     "LogUniform",
     "Normal",
     "Recipe",
@@ -57,7 +57,7 @@ class Distribution(Protocol):
 
 
 class Recipe(NamedTuple):
-    """How the C extension draws the values of ``sample``, to the last bit.
+    """Form of a distribution in which the C extension draws exactly the values of ``sample``.
 
     Attributes:
         kind: One of the kinds of ``native/draws.h``.
@@ -175,7 +175,7 @@ class Normal(KnownArguments):
 
 @dataclass(frozen=True)
 class Choice(KnownArguments):
-    """One of the given values, with equal or the given probabilities.
+    """Distribution over some values, with equal or the given probabilities.
 
     The values are numbers; for a parameter that is an Enumeration they may be names of its items.
 
@@ -222,7 +222,7 @@ class Choice(KnownArguments):
 
 
 @dataclass(frozen=True)
-class Column(Choice):
+class DrawnColumn(Choice):
     """A column of a table of which each episode draws one row, for all of the table's columns.
 
     By itself it is a ``Choice``.
@@ -280,7 +280,7 @@ class Truncated:
 _KINDS: Final[Mapping[str, type[Any]]] = {
     kind.distribution: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
-_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), Column)
+_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), DrawnColumn)
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _LEAST_SHARE: Final = 0.01
 """Of the draws that must lie within limits, so that there are few redraws."""
@@ -289,7 +289,7 @@ _MOST_REDRAWS: Final = 10_000
 
 
 def support_of(distribution: Any) -> tuple[float, float]:
-    """The lowest and the highest value that can be drawn; infinite where that is not known."""
+    """Lowest and highest possible value; infinite if it is not known."""
     if isinstance(distribution, Choice):
         values = list(map(float, distribution.values))
         return min(values), max(values)
@@ -388,7 +388,7 @@ def draw_all(distributions: Iterable[Any], rng: np.random.Generator) -> list[Any
     places: dict[str, int] = {}
     values = []
     for one in distributions:
-        if type(one) is not Column:
+        if type(one) is not DrawnColumn:
             values.append(draw(one, rng))
             continue
         if one.table not in places:
@@ -401,15 +401,15 @@ def together(distributions: Sequence[Any], recipes: Sequence[Recipe]) -> list[Re
     """Let recipes draw as ``draw_all`` does.
 
     Args:
-        distributions: What is drawn from.
-        recipes: Of each by itself.
+        distributions: Distributions to draw from.
+        recipes: Recipe of each distribution.
 
     Returns:
         The recipes; None if columns of a table do not stand side by side.
     """
     found, tables, before = list(recipes), set[str](), ""
     for place, one in enumerate(distributions):
-        table = one.table if type(one) is Column else ""
+        table = one.table if type(one) is DrawnColumn else ""
         if table and table == before:
             found[place] = found[place]._replace(kind="same_row")
         elif table in tables:
@@ -441,7 +441,7 @@ def recipe_of(distribution: Any, convert: Callable[[Any], float]) -> Recipe | No
 
 
 def _items(values: Any) -> list[Any]:
-    """The elements of what should be a list; none if it is no list."""
+    """Elements of a list; none for other values."""
     if isinstance(values, str | bytes) or not isinstance(values, Iterable):
         return []
     try:

@@ -1,4 +1,4 @@
-"""The errors of fmugym.
+"""Exceptions of fmugym.
 
 ::
 
@@ -44,7 +44,7 @@ __all__ = [
     "nearest_name",
     "plain",
     "printable",
-    "reading",
+    "reading_file",
     "reason",
     "shown",
     "unknown_argument",
@@ -65,7 +65,7 @@ _warned: Final[set[str]] = set()
 
 
 def printable(text: object) -> str:
-    r"""Escape what a terminal may obey or a log may take for a line of its own.
+    r"""Escape characters that a terminal may obey or a log may take for a new line.
 
     Names, descriptions and messages of an FMU are foreign texts. Every exit uses this function:
     errors, logs, infos and the command line.
@@ -167,7 +167,7 @@ def shown(value: object) -> str:
 
 
 def first_of(names: Sequence[str]) -> str:
-    """The first of some names for a message, which tells how many more there are."""
+    """Name the first of some names in a message, and count the others."""
     few = ", ".join(names[:_MOST_NAMES]) or "nothing"
     more = len(names) - _MOST_NAMES
     return printable(f"{few} and {more} more" if more > 0 else few)
@@ -180,7 +180,7 @@ def reason(error: Exception) -> str:
 
 
 @contextmanager
-def reading(failure: str) -> Iterator[None]:
+def reading_file(failure: str) -> Iterator[None]:
     """While a file is read, make a ``ConfigError`` of whatever a damaged one raises.
 
     Args:
@@ -198,7 +198,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     """Make the error for a name that does not exist.
 
     Args:
-        kind: What the name should have named, for example ``"config key"``.
+        kind: Kind of the named thing, for example ``"config key"``.
         name: The name that was given.
         known: All valid names.
 

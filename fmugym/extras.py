@@ -1,4 +1,4 @@
-"""Libraries that an extra installs and that are imported when they are used; a compiler for C."""
+"""Optional libraries of extras, imported when they are used; and a compiler for C."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _COMPILERS: Final = ("cc", "gcc", "clang")
 
 
 def installation(extra: str) -> str:
-    """Say how to install an extra; ``docs/README.md`` says more."""
+    """Describe the installation of an extra; ``docs/README.md`` has more."""
     return f"install the extra {extra!r}; in a clone of fmugym: pip install '.[{extra}]'"
 
 
 def lacking(what: str, library: str, extra: str) -> str:
-    """Say that a library is missing, and how to install it.
+    """Describe a missing library, and its installation.
 
     Args:
-        what: What needs it.
+        what: Name of the feature that needs it.
         library: Its name.
         extra: The extra that installs it.
     """
@@ -45,10 +45,10 @@ def imported(module: str, extra: str) -> Any:
 
 
 def c_compiler(what: str, target: str | None = None, *, is_own: bool = True) -> list[str]:
-    """The command of a compiler for C: that of this system, or ziglang.
+    """Find the command of a compiler for C: that of this system, or ziglang.
 
     Args:
-        what: What is to be built, for the error.
+        what: Name of the built thing, for the error.
         target: The target triple that ziglang builds for; None for this processor.
         is_own: Whether it is for this platform, so that the compiler of the system serves.
 

@@ -1,4 +1,4 @@
-"""Files that take the place of older ones, which stay until the new ones are complete."""
+"""Replacement of files: older ones stay until the new ones are complete."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["replaced", "replaced_together", "write_whole"]
 
 @contextmanager
 def replaced_together() -> Iterator[Callable[[Path], Path]]:
-    """Replace files together: where one cannot be written, as on a full disk, all old ones stay.
+    """Replace files together: if one cannot be written, all old ones stay.
 
     ::
 
@@ -48,7 +48,7 @@ def replaced(path: Path) -> Iterator[Path]:
     """Replace one file.
 
     Args:
-        path: Of the file.
+        path: Path of the file.
 
     Yields:
         Where to write it first.

@@ -1,4 +1,4 @@
-"""Parameters of a task's FMU from logs of the plant, and the rows that a task draws from them.
+"""Fit of a task's FMU to logs of the plant, and the parameter rows that a task draws from it.
 
 ::
 
@@ -29,8 +29,8 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
 from fmugym.identification.problem import start_between
-from fmugym.identification.simulator import Experiment, median_interval, silent
-from fmugym.logs import Columns, PlantLog, declared_as
+from fmugym.identification.simulator import FitSettings, median_interval, silent
+from fmugym.logs import LogColumns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
 from fmugym.task.starting import start_variable
 
@@ -43,10 +43,10 @@ _WASH_IN: Final = 0.1
 """Of the shortest log, the part that is not counted if nobody says another."""
 
 _ROWS: Final = 1000
-"""How many are written."""
+"""Number of written rows."""
 
 _OFF: Final = 1e-3
-"""How far from a step the rows of means may be, as a part of it."""
+"""Tolerated deviation of a row of means from a step, as a part of it."""
 
 
 def fit_logs(
@@ -98,7 +98,7 @@ def fit_logs(
         if wash_in is None:
             shortest = min(float(np.ptp(one.time)) for one in trajectories)
             wash_in = 0.0 if states else _WASH_IN * shortest
-        experiment = Experiment(
+        experiment = FitSettings(
             plant.env.fmu,
             initial_states=states,
             fixed={n: v for n, v in plant.given.items() if n not in wanted | states},
@@ -125,7 +125,7 @@ def write_rows(fit: FitResult, path: str | os.PathLike[str]) -> None:
 
 
 class _Plant:
-    """The task's side of a fit: names, units, and what is given."""
+    """Task of a fit: names, units and given values."""
 
     def __init__(self, env: Any, columns: dict[str, str]) -> None:
         self.env, self._columns = inner_env(env), columns
@@ -137,8 +137,8 @@ class _Plant:
         }
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:
-        """The episodes of a log, in the units of the FMU; what was not measured parts them."""
-        spec, columns = self.env.pool_spec, Columns(self.env, log, self._columns)
+        """Episodes of a log in the units of the FMU, divided at missing measurements."""
+        spec, columns = self.env.pool_spec, LogColumns(self.env, log, self._columns)
         for variable in spec.inputs:
             columns.require(variable)
         measured = [variable for variable in spec.outputs if columns.has(variable)]
@@ -160,7 +160,7 @@ class _Plant:
             )
 
     def require_steps(self, trajectories: Sequence[Trajectory]) -> None:
-        """Refuse rows that are no steps apart, if a measured value is that of a whole step."""
+        """Refuse rows that are not a step apart, if a measured value is the mean of a step."""
         spec, step = self.env.pool_spec, median_interval(trajectories)
         whole = [v for v in spec.outputs if v.sampling != "last"]
         sampled = [f"{v.sampling} of {v.name}" for v in whole if v.name in trajectories[0].outputs]

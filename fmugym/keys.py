@@ -1,6 +1,6 @@
-"""Keys of configs, task files and systems, each of which is declared once.
+"""Keys of configs, task files and systems: kinds, checks and descriptions, declared once.
 
-Kinds and tables are data. ``checked`` and ``with_paths`` read them, and so does
+Kinds and tables are data. ``checked_entry`` and ``with_paths`` read them, and so does
 ``docs/_site/keys.py``, which writes the tables of the documents and the JSON Schema for editors.
 """
 
@@ -40,16 +40,16 @@ __all__ = [
     "Mistake",
     "Table",
     "check_fields",
-    "checked",
+    "checked_entry",
     "found_mistakes",
     "key",
     "option",
     "or_none",
-    "table_of",
+    "table_of_fields",
     "with_paths",
 ]
 
-Keys = tuple[str, ...]
+_Keys = tuple[str, ...]
 
 REQUIRED: Final = object()
 """The default of a key that must be given."""
@@ -77,7 +77,7 @@ class Listed:
     """A list of values of one kind.
 
     Attributes:
-        kind: That of the values.
+        kind: Kind of the values.
         or_one: Whether a single value stands for a list of one.
         most: How many there may be; None for any number.
     """
@@ -92,7 +92,7 @@ class Entries:
     """A table of values of one kind under names of the user's choice.
 
     Attributes:
-        kind: That of the values.
+        kind: Kind of the values.
         most: How many there may be; None for any number.
     """
 
@@ -114,7 +114,7 @@ class Table:
 
     Attributes:
         keys: By name.
-        what: What a key of it is called, for errors.
+        what: Name of a key of it, for errors.
         short: The key whose value may stand for the table; "" for none.
         one_of: Exactly one of these must be given.
         elsewhere: Names that are no keys of it, and what to do instead.
@@ -136,8 +136,8 @@ class Key(NamedTuple):
     """A key of a table.
 
     Attributes:
-        kind: What its value may be.
-        text: What it means, in Markdown.
+        kind: Kind of its value.
+        text: Meaning, in Markdown.
         default: Its value where it is not given; ``REQUIRED`` if it must be given.
         shown: The default in words, for the documents, if the value does not tell it.
     """
@@ -149,20 +149,20 @@ class Key(NamedTuple):
 
 
 class Mistake(NamedTuple):
-    """What is wrong with a value.
+    """Mistake in a value.
 
     Attributes:
         keys: The keys that lead to it.
-        text: What was expected, and what was given.
+        text: Expected and given value.
         is_unknown: Whether there is no such key.
     """
 
-    keys: Keys
+    keys: _Keys
     text: str
     is_unknown: bool = False
 
 
-def checked(kind: AnyKind, value: Any) -> Any:
+def checked_entry(kind: AnyKind, value: Any) -> Any:
     """Check a value in Python.
 
     Returns:
@@ -181,12 +181,12 @@ def found_mistakes(kind: AnyKind, value: Any) -> tuple[Any, list[Mistake]]:
     """Check a value, and find everything that is wrong with it.
 
     Args:
-        kind: What it may be.
+        kind: Kind of the value.
         value: As the user gave it.
 
     Returns:
-        The value as in ``checked``, as far as it is right, and the mistakes. A key of a table whose
-        value is wrong is not in it.
+        The value as in ``checked_entry``, as far as it is right, and the mistakes. A key of a table
+        whose value is wrong is not in it.
     """
     reading = _Reading([])
     return reading.read(kind, (), value), reading.mistakes
@@ -197,7 +197,7 @@ class _Reading(NamedTuple):
 
     mistakes: list[Mistake]
 
-    def read(self, kind: AnyKind, keys: Keys, value: Any) -> Any:
+    def read(self, kind: AnyKind, keys: _Keys, value: Any) -> Any:
         """The value as the package uses it; None if it is wrong."""
         match kind:
             case Kind():
@@ -224,13 +224,13 @@ class _Reading(NamedTuple):
                 }
         return self._table(kind, keys, value)
 
-    def _note(self, keys: Keys, text: object, is_unknown: bool = False) -> None:
+    def _note(self, keys: _Keys, text: object, is_unknown: bool = False) -> None:
         self.mistakes.append(Mistake(keys, str(text), is_unknown))
 
-    def _too_many(self, keys: Keys, most: int, given: Sized) -> None:
+    def _too_many(self, keys: _Keys, most: int, given: Sized) -> None:
         self._note(keys, f"{keys[-1]} has at most {most} names, got {len(given)}")
 
-    def _items(self, keys: Keys, value: Any) -> dict[str, Any] | None:
+    def _items(self, keys: _Keys, value: Any) -> dict[str, Any] | None:
         what = keys[-1] if keys else "a task"
         try:
             return check_mapping(what, value)
@@ -239,7 +239,7 @@ class _Reading(NamedTuple):
                 keys, f"{what} must be a table with names as keys (a dict), got {shown(value)}"
             )
 
-    def _table(self, table: Table, keys: Keys, value: Any) -> Any:
+    def _table(self, table: Table, keys: _Keys, value: Any) -> Any:
         if table.make is not None and isinstance(value, table.make):
             return value
         before = len(self.mistakes)
@@ -263,7 +263,7 @@ class _Reading(NamedTuple):
         right = {n: one for n, one in given.items() if one is not None or items[n] is None}
         return defaults | right
 
-    def _value(self, table: Table, name: str, keys: Keys, value: Any) -> Any:
+    def _value(self, table: Table, name: str, keys: _Keys, value: Any) -> Any:
         if name in table.keys:
             one = table.keys[name]
             is_unset = value is None and one.default is None
@@ -272,7 +272,7 @@ class _Reading(NamedTuple):
             return self._note(keys, f"{name!r} is no {table.what}{table.elsewhere[name]}", True)
         return self._note(keys, unknown_name(table.what, name, table.keys), True)
 
-    def _require(self, table: Table, keys: Keys, given: Mapping[str, Any]) -> None:
+    def _require(self, table: Table, keys: _Keys, given: Mapping[str, Any]) -> None:
         for name, one in table.keys.items():
             if one.default is REQUIRED and name not in given:
                 self._note(keys, f"the {table.what} {name!r} is missing")
@@ -293,7 +293,7 @@ def with_paths(kind: AnyKind, value: Any, path_of: Callable[[str], str]) -> Any:
     """Return a value as the user gave it, with other paths.
 
     Args:
-        kind: What it may be.
+        kind: Kind of the value.
         value: The value.
         path_of: Takes a path, and returns the new one.
     """
@@ -330,12 +330,12 @@ def key(kind: AnyKind, text: str, default: Any = REQUIRED, shown: str = "") -> A
     return field(default=default, metadata=declared)
 
 
-def table_of(cls: Any, **options: Any) -> Table:
+def table_of_fields(cls: Any, **options: Any) -> Table:
     """Make the table of the keys of a dataclass.
 
     Args:
         cls: The class.
-        options: Of the ``Table``.
+        options: Options of the ``Table``.
     """
     return Table({one.name: one.metadata["key"] for one in fields(cls)}, **options)
 
@@ -346,12 +346,12 @@ def check_fields(made: Any) -> None:
     Raises:
         ConfigError: For values that are wrong; it names all of them.
     """
-    for name, value in checked(table_of(type(made)), vars(made)).items():
+    for name, value in checked_entry(table_of_fields(type(made)), vars(made)).items():
         object.__setattr__(made, name, value)
 
 
 def option(*known: str) -> Kind:
-    """One of some texts."""
+    """Make the kind of a choice among some texts."""
     return Kind(partial(check_option, known=known), {"enum": list(known)})
 
 

@@ -1,4 +1,4 @@
-"""Names of packages that are imported when they are first used."""
+"""Lazy imports of the names of packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of a plant, played through a task: rewards, observations and ends without the FMU's code.
+"""Log of a plant, played through a task: rewards, observations and ends without the FMU.
 
 ::
 
@@ -32,14 +32,14 @@ from fmugym.checks import Spellings, by_own_names, check_number, normal_form
 from fmugym.declared import Task
 from fmugym.declared.data_files import read_tables
 from fmugym.declared.data_rows import usual_distance
-from fmugym.declared.data_tables import Column, Table
-from fmugym.declared.dates import CURE, HOUR, YEAR, zone_of
+from fmugym.declared.data_tables import DataColumn, DataTable
+from fmugym.declared.dates import HOUR, LOCAL_TIME_ADVICE, YEAR, zone_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.series import read_data
 from fmugym.declared.standard_time import standard_time
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, reading, shown, unknown_name
+from fmugym.errors import ConfigError, reading_file, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray
 from fmugym.recording import Recorder, Recording
@@ -47,7 +47,7 @@ from fmugym.task.actions import flat_inputs
 
 __all__ = [
     "Actions",
-    "Columns",
+    "LogColumns",
     "PlantLog",
     "as_logged",
     "declared_as",
@@ -61,7 +61,7 @@ _SAME_TIME: Final = 1e-9
 """Times that differ by less, in seconds, are the same."""
 
 _PROPOSED: Final = "proposed."
-"""What the names of columns of proposals begin with."""
+"""Beginning of the names of columns of proposals."""
 
 _MOST_ACTIONS: Final = 10_000
 """The most actions of discrete spaces that are tried out for a row."""
@@ -69,7 +69,7 @@ _MOST_ACTIONS: Final = 10_000
 
 @dataclass(frozen=True)
 class PlantLog:
-    """What a plant has measured.
+    """Measurements of a plant.
 
     Columns are also found by names whose letters only look other; see ``find``.
 
@@ -124,7 +124,7 @@ class PlantLog:
         """
         zone = None if timezone is None else zone_of("timezone", timezone)
         columns, units = _columns(path)
-        time = Table([*columns.values()]).find_time()
+        time = DataTable([*columns.values()]).find_time()
         if time is None or units.pop(time.name, "s") != "s":
             raise ConfigError(f"{shown(str(path))} has no column 'time' of seconds or dates")
         del columns[time.name]
@@ -193,11 +193,11 @@ def _heading(text: str) -> tuple[str, str | None]:
     return match["name"], unit
 
 
-def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, Column], dict[str, str]]:
+def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, DataColumn], dict[str, str]]:
     """The columns of a log by name, and their units."""
-    with reading(f"{shown(str(path))} cannot be read"):
+    with reading_file(f"{shown(str(path))} cannot be read"):
         (table,) = read_tables(Path(path)).values()
-    columns: dict[str, Column] = {}
+    columns: dict[str, DataColumn] = {}
     units: dict[str, str] = {}
     numbers: dict[str, int] = {}
     for number, column in enumerate(table.columns, 1):
@@ -216,9 +216,9 @@ def _columns(path: str | os.PathLike[str]) -> tuple[dict[str, Column], dict[str,
 
 
 def _times(
-    time: Column, zone: datetime.tzinfo | None, standard: int | None
+    time: DataColumn, zone: datetime.tzinfo | None, standard: int | None
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """The times in seconds, without those of 29 February, and which rows they are of."""
+    """Times in seconds without 29 February, and the rows of these times."""
     if time.is_numeric:
         return time.numbers, np.ones(len(time.rows), np.bool_)
     dates = time.dates_in(zone)
@@ -229,14 +229,14 @@ def _times(
         row = int(back[0])
         raise ConfigError(
             f"the times must rise, but in {time.table} {time.when(row + 1)} is not above "
-            f"{time.when(row)}. {CURE}"
+            f"{time.when(row)}. {LOCAL_TIME_ADVICE}"
         )
     is_known = ~np.isnan(seconds)
     return seconds[is_known], is_known
 
 
 def _episodes(times: FloatArray, is_known: npt.NDArray[np.bool_]) -> FloatArray:
-    """Numbers of the episodes, which end at gaps, and where the time goes back."""
+    """Numbers of the episodes, which end at gaps, and at times that go back."""
     usual, distances = usual_distance(times), np.diff(times, prepend=times[:1])
     is_gap = distances > (math.inf if usual is None else 2 * usual * (1 + 1e-6))
     left_out = np.diff(np.cumsum(~is_known)[is_known], prepend=0) > 0
@@ -244,7 +244,7 @@ def _episodes(times: FloatArray, is_known: npt.NDArray[np.bool_]) -> FloatArray:
 
 
 def _require_rising(
-    time: Column, rows: npt.NDArray[Any], times: FloatArray, episodes: FloatArray
+    time: DataColumn, rows: npt.NDArray[Any], times: FloatArray, episodes: FloatArray
 ) -> None:
     wrong = (~(np.diff(times) > 0.0)) & (np.diff(episodes) == 0)
     if not np.isfinite(times).all():
@@ -312,7 +312,7 @@ class _Plant:
 
     @property
     def left(self) -> int:
-        """How many steps are left."""
+        """Number of steps that are left."""
         return len(self.rows) - 1 - self.row
 
     def reset(self, start_values: Mapping[str, Any]) -> dict[str, float]:
@@ -340,7 +340,7 @@ class _Player:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
         self._plant, self._log, self._time_step = plant, log, inner.pool_spec.time_step
         self._needed = *inner.pool_spec.outputs, *inner.pool_spec.inputs
-        self._columns = Columns(inner, log, columns)
+        self._columns = LogColumns(inner, log, columns)
         for variable in inner.pool_spec.outputs:
             self._columns.require(variable)
         self._actions = Actions(inner, self._columns.range_of, tolerance)
@@ -433,7 +433,7 @@ def _section(env: FMUEnv, key: str) -> Mapping[str, Any]:
     return section
 
 
-class Columns:
+class LogColumns:
     """The columns of a log as variables of an FMU, in the units of the FMU."""
 
     def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:
@@ -462,7 +462,7 @@ class Columns:
             raise unknown_name("column of the log", variable.name, self._columns)
 
     def range_of(self, variable: Variable) -> float:
-        """How far apart the values of a variable are; 1 if they are all the same."""
+        """Width of the range of a variable; 1 if all values are the same."""
         self.require(variable)
         column, to_log = self._from[variable.name]
         values = to_log.inverse(self._columns[column])
@@ -553,7 +553,7 @@ class Actions:
         return action
 
     def inputs(self, action: Any) -> FloatArray:
-        """What the environment would write for an action, one number for each input."""
+        """Inputs that the environment would write for an action, one number for each."""
         env, before = self._env, self._env.action
         env.action = action
         try:

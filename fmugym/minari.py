@@ -1,4 +1,4 @@
-"""Recordings as datasets of Minari, for learning from them offline, and back.
+"""Datasets of Minari for offline learning, made of recordings, and back.
 
 Needs the extra ``minari``. See ``docs/datasets.md``.
 """
@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
-from fmugym.recording import FACTS, Recording, element_from, flat_element
+from fmugym.recording import METADATA, Recording, element_from, flat_element
 from fmugym.task.saving import scope_of
 from fmugym.task.snapshot import require_scope
 
@@ -32,7 +32,7 @@ except ImportError as error:
 __all__ = ["read_dataset", "write_dataset"]
 
 _KEY: Final = "fmugym"
-"""Where the options of an episode keep what a ``Recording`` knows besides numbers."""
+"""Key of an episode's options for the facts of a ``Recording`` besides numbers."""
 
 
 def write_dataset(
@@ -114,7 +114,7 @@ def _loaded(name: str) -> minari.MinariDataset:
 
 
 def _buffer(number: int, recording: Recording, env: FMUEnv) -> EpisodeBuffer:
-    facts = {name: getattr(recording, name) for name in FACTS}
+    facts = {name: getattr(recording, name) for name in METADATA}
     return EpisodeBuffer(
         id=number,
         seed=recording.seed,
@@ -135,7 +135,7 @@ def _stacked(space: Space[Any], rows: npt.NDArray[Any]) -> Any:
 
 
 def _facts_of(metadata: Any, dataset: minari.MinariDataset) -> dict[str, Any]:
-    """What ``_buffer`` has put into the options; the storages of Minari nest them differently."""
+    """Facts that ``_buffer`` has put into the options; storages of Minari nest them differently."""
     text = metadata.get(f"options/{_KEY}") or metadata.get("options", {}).get(_KEY)
     if text is None:
         raise ConfigError(

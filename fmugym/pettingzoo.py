@@ -1,4 +1,4 @@
-"""Several agents on one system: PettingZoo's ``ParallelEnv`` over an environment of fmugym.
+"""Multi-agent environment: PettingZoo's ``ParallelEnv`` over an environment of fmugym.
 
 Needs the extra ``pettingzoo``. See ``docs/systems.md``.
 """
@@ -37,7 +37,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class Agent:
-    """What one agent of a system does and sees.
+    """Actions, observations and reward of one agent of a system.
 
     Attributes:
         actions: The names of the elements of the environment's action that it decides on. Together,
@@ -79,7 +79,7 @@ class FMUParallelEnv(ParallelEnv[str, Array, Array]):
     Attributes:
         env: As given.
         possible_agents: The names of the agents.
-        agents: Those that are acting: all of them in an episode, none after its end.
+        agents: Agents that are acting: all of them in an episode, none after its end.
 
     Raises:
         ConfigError: If the spaces do not fit, a name is unknown, or an action belongs to no agent
@@ -103,11 +103,11 @@ class FMUParallelEnv(ParallelEnv[str, Array, Array]):
         self.agents: list[str] = []
 
     def observation_space(self, agent: str) -> spaces.Box:
-        """What an agent sees; the same object at each call."""
+        """Observation space of an agent; the same object at each call."""
         return self._found(agent).observation_space
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """What an agent does; the same object at each call."""
+        """Action space of an agent; the same object at each call."""
         return self._found(agent).action_space
 
     def _found(self, agent: str) -> _Part:

@@ -40,10 +40,10 @@ from fmugym.task.snapshot import require_scope
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
 
 __all__ = [
-    "FACTS",
+    "METADATA",
     "Recorder",
     "Recording",
-    "Report",
+    "ReplayReport",
     "element_from",
     "flat_element",
     "replay",
@@ -57,7 +57,7 @@ _MOST_BYTES: Final = 2**30
 
 
 def surroundings() -> dict[str, str]:
-    """What the last bits of results may depend on, by name."""
+    """Facts by name on which the last bits of results may depend."""
     features: dict[str, bool] = getattr(_multiarray_umath, "__cpu_features__", {})
     return {
         "fmugym": version("fmugym-toolbox"),
@@ -118,7 +118,7 @@ class Recording:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the recording to a file, in the format ``npz`` of numpy."""
         fields = {name: getattr(self, name) for name in _ARRAYS}
-        header = {name: getattr(self, name) for name in FACTS}
+        header = {name: getattr(self, name) for name in METADATA}
         text = json.dumps({"version": _VERSION, **header}).encode()
         with replaced(Path(path)) as part, part.open("wb") as file:
             np.savez_compressed(file, header=np.frombuffer(text, np.uint8), **fields)
@@ -143,15 +143,15 @@ class Recording:
             ) from None
 
 
-FACTS: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
-"""What a recording holds besides arrays."""
+METADATA: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
+"""Names of the facts of a recording besides arrays."""
 
 _ARRAYS: Final = {
     **dict.fromkeys(("actions", "observations"), ("biuf", None)),
     "rewards": ("f", 1),
     **dict.fromkeys(("terminated", "truncated"), ("b", 1)),
 }
-"""The kinds of numbers in each array, and how many dimensions it has; None for any."""
+"""Kinds of numbers and of dimensions of each array; None for any."""
 
 
 def _require_small(archive: zipfile.ZipFile) -> None:
@@ -163,7 +163,7 @@ def _require_small(archive: zipfile.ZipFile) -> None:
 
 
 def _facts(header: dict[str, Any]) -> dict[str, Any]:
-    """What a header says; raises whatever its damage leads to."""
+    """Read the facts of a header; damage raises any exception."""
     if header["version"] != _VERSION:
         raise ValueError("it is of another version of the format")
     stream, seed = tuple(map(int, header["stream"])), header["seed"]
@@ -247,13 +247,13 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 @dataclass(frozen=True)
-class Report:
-    """What a replay has shown.
+class ReplayReport:
+    """Result of a replay.
 
     Attributes:
         steps: How many steps were replayed.
         difference: The first difference; "" if all is equal to the last bit.
-        surroundings: What was otherwise when the episode was recorded, by name: then and now.
+        surroundings: Differences in the surroundings, by name: then and now.
     """
 
     steps: int
@@ -273,7 +273,7 @@ class Report:
         return f"{self.steps} steps were replayed: {told}{f' ({others})' if others else ''}"
 
 
-def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
+def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> ReplayReport:
     """Play a recorded episode again, and compare it to the last bit.
 
     Args:
@@ -297,7 +297,7 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
     while not found and steps < len(recording):
         found = _difference_of_step(recording, env, steps)
         steps += 1
-    return Report(steps, found, others)
+    return ReplayReport(steps, found, others)
 
 
 def _difference_of_starts(

@@ -76,7 +76,7 @@ def register_bundled() -> None:
 
 
 def _entry_point(env: Any) -> Any:
-    """The text ``"module:Class"`` where it leads to the class, the class itself otherwise."""
+    """Text ``"module:Class"`` if it leads to the class, the class itself otherwise."""
     if isinstance(env, str):
         module, _, name = env.partition(":")
         if not module or not name.isidentifier():

@@ -1,4 +1,4 @@
-"""FMU tasks for RLlib on Ray: each env runner steps one ``FMUVectorEnv``.
+"""Vector environments for RLlib on Ray: each env runner steps one ``FMUVectorEnv``.
 
 Needs the extra ``rllib``. See ``docs/rllib.md``.
 """
@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 _OF_TASKS: Final = "fmugym/FMU-v0"
 _MOST_BYTES: Final = 100 * 2**20
-"""What a registration may carry: Ray keeps it in the memory of the head node."""
+"""Largest size of a registration, which Ray keeps in the memory of the head node."""
 
 
 def register_task(
@@ -157,7 +157,7 @@ class _Maker:
         return cls(env if task is None else _OF_TASKS, left, paths, document, files)
 
     def __call__(self, context: Mapping[str, Any]) -> Any:
-        """Make a vector environment if RLlib says how many, or else a single one."""
+        """Make a vector environment of the size that RLlib gives, or else a single one."""
         arguments = {**self._local(), **context}
         num_envs = arguments.pop("num_envs", None)
         if num_envs is None:
@@ -195,7 +195,7 @@ def _is_file(value: Any) -> bool:
 
 
 def _processors() -> int:
-    """How many processors Ray has given to this runner; 1 where Ray says nothing."""
+    """Number of processors that Ray has given to this runner; 1 if Ray gives none."""
     if not ray.is_initialized():
         return 1
     with suppress(Exception):  # the driver has no resources of its own

@@ -1,4 +1,4 @@
-"""FMU environments for Stable-Baselines3: a ``VecEnv`` over ``FMUVectorEnv``.
+"""Vector environment for Stable-Baselines3: a ``VecEnv`` over ``FMUVectorEnv``.
 
 Needs the extra ``sb3``. See ``docs/libraries.md``.
 """
@@ -37,7 +37,7 @@ __all__ = ["FMUVecEnv", "ResidualActions", "ScaledActions", "make_sb3_env"]
 
 
 Indices = int | Iterable[int] | None
-StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
+_StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
 
 _NOTHING_ENDED: dict[str, Any] = {"TimeLimit.truncated": False}
 """The info of a step after which the episode goes on."""
@@ -150,8 +150,8 @@ class FMUVecEnv(VecEnv):
         if self._overlap:
             self._outer.step_async(actions)
 
-    def step_wait(self) -> StepReturn:
-        """Step all environments; those whose episode ends start the next one.
+    def step_wait(self) -> _StepReturn:
+        """Step all environments; an environment whose episode ends starts the next one.
 
         Returns:
             Observations, rewards, dones and infos in SB3's form. Where an episode ended, the
@@ -176,7 +176,7 @@ class FMUVecEnv(VecEnv):
         infos: dict[str, Any],
         listed: list[dict[str, Any]],
     ) -> None:
-        """Separate the infos of the last step from those of the reset that followed it."""
+        """Separate the infos of the last step from the infos of the reset after it."""
         last, last_infos = infos.pop("final_obs"), infos.pop("final_info")
         handed_out(last_infos, listed)
         others = list(listed)
@@ -225,7 +225,7 @@ class FMUVecEnv(VecEnv):
         self._set_parameters[attr_name] = complete
 
     def _all_values(self, name: str, given: Mapping[int, Any]) -> list[Any]:
-        """The values of a parameter for all environments: those given, or else the present ones."""
+        """Values of a parameter for all environments: given ones, and present ones for the rest."""
         present = [] if len(given) == self.num_envs else self._present_values(name)
         return [given[i] if i in given else present[i] for i in range(self.num_envs)]
 

@@ -1,4 +1,4 @@
-"""Actions from -1 to 1 that stand for the whole ranges of a task's actions."""
+"""Scaling of actions from -1 to 1 to the whole ranges of a task's actions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def are_scaled(own: spaces.Space[Any], space: spaces.Space[Any]) -> bool:
 
     Args:
         own: The action space of the agent.
-        space: That of the task.
+        space: Space of the task.
     """
     is_unit = isinstance(own, spaces.Box) and _is_unit(own)
     return is_unit and own.shape == space.shape and can_be_scaled(space)

@@ -1,4 +1,4 @@
-"""Checks that an environment of yours keeps the contract of this package.
+"""Checks that an environment class keeps the contract of this package.
 
 ``check_fmu_env`` finds what often goes wrong when a new FMU is integrated: a reset that does not
 restore everything, parameters without effect, observations outside of their space. The project's
@@ -52,7 +52,7 @@ class _Transition(NamedTuple):
 
 @dataclass(frozen=True)
 class _Start:
-    """How an episode begins."""
+    """Beginning of an episode."""
 
     seed: int | None = None
     parameters: Mapping[str, float] = field(default_factory=dict)

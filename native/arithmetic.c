@@ -1,3 +1,5 @@
+/* Arithmetic instructions of programs: sums, products, comparisons and logic. */
+
 #include "operations.h"
 
 #include <math.h>

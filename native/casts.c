@@ -1,3 +1,5 @@
+/* Instructions of programs that convert between types. */
+
 #include "operations.h"
 
 #include "platform.h"

@@ -1,3 +1,5 @@
+/* Clocks of an instance: their intervals, ticks and activation. */
+
 #include "clock.h"
 
 #include <float.h>

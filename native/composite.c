@@ -1,3 +1,5 @@
+/* The table of functions by which a system looks like one FMU. */
+
 #include "system.h"
 
 /* Systems are loaded by system_load. */

@@ -1,3 +1,5 @@
+/* Copies of a pool's library, for FMUs that allow only some instances with one. */
+
 #include "copies.h"
 
 #include <stdio.h>

@@ -1,3 +1,5 @@
+/* Directional and adjoint derivatives of the instances of a pool. */
+
 #include "derivatives.h"
 
 #include <stdlib.h>

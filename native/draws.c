@@ -1,3 +1,5 @@
+/* Draws from distributions, with the same values as numpy's. */
+
 #include "draws.h"
 
 #include <math.h>

@@ -1,3 +1,5 @@
+/* Entry into a pool by one thread at a time, and exit from it. */
+
 #include "inside.h"
 #include "snapshots.h"
 

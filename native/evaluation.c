@@ -1,3 +1,5 @@
+/* Evaluation of a program on the arrays of N environments. */
+
 #include "program.h"
 
 #include <string.h>

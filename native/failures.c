@@ -1,3 +1,5 @@
+/* Failures of instances: their statuses, messages and values; health counters. */
+
 #include "failures.h"
 
 #include <math.h>

@@ -1,3 +1,5 @@
+/* The table of functions for a version of FMI and an interface. */
+
 #include "fmi.h"
 
 const Fmi *fmi_table(int64_t version, int64_t manner) {

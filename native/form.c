@@ -1,3 +1,5 @@
+/* Reader of forms: settings, variables, systems and programs as bytes, checked. */
+
 #include "form.h"
 
 #include <math.h>

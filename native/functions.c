@@ -1,3 +1,5 @@
+/* Mathematical functions of programs: powers, remainders and turns. */
+
 #include "operations.h"
 
 #include <math.h>

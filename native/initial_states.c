@@ -1,3 +1,5 @@
+/* Resets of an instance: initialization, warm-up, and return to a saved start. */
+
 #include "initial_states.h"
 
 #include <stdlib.h>

@@ -1,3 +1,5 @@
+/* Instances: creation, replacement, and saved states. */
+
 #include "instances.h"
 
 #include "copies.h"

@@ -1,3 +1,5 @@
+/* Integration of the equations of an instance, with its events. */
+
 #include <float.h>
 #include <math.h>
 #include <stdlib.h>

@@ -1,3 +1,5 @@
+/* Loading of the library of an FMU, or of the libraries of a system. */
+
 #include "loading.h"
 
 #include "system.h"

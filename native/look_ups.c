@@ -1,3 +1,5 @@
+/* Instructions of programs that look up values in tables and interpolate. */
+
 #include "operations.h"
 
 #include <math.h>

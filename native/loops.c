@@ -1,3 +1,5 @@
+/* Newton's method for the algebraic loops of a system. */
+
 #include "loops.h"
 
 #include <math.h>

@@ -1,3 +1,5 @@
+/* The methods of integration by name. */
+
 #include "methods.h"
 
 #include <string.h>

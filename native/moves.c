@@ -1,3 +1,5 @@
+/* Instructions of programs that load and store rows. */
+
 #include "operations.h"
 
 #include <float.h>

@@ -1,3 +1,5 @@
+/* The parts of a vector environment's step around the steps of the instances. */
+
 #include "play.h"
 
 #include <float.h>

@@ -1,3 +1,5 @@
+/* Reader of the form of a play. */
+
 #include "play_form.h"
 
 #include <stdlib.h>

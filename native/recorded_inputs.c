@@ -1,3 +1,5 @@
+/* Records of start values and inputs, by which episodes are played again. */
+
 #include "recorded_inputs.h"
 
 #include <stdlib.h>

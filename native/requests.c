@@ -1,3 +1,5 @@
+/* Answers to requests of a pool's owner, as forms. */
+
 #include "requests.h"
 
 #include <stdlib.h>

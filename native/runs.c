@@ -1,3 +1,5 @@
+/* Runs of neighbouring instances, which are stepped with their programs. */
+
 #include "runs.h"
 
 #include <float.h>

@@ -1,3 +1,5 @@
+/* The division of a call's work among threads. */
+
 #include "schedule.h"
 
 #include <math.h>

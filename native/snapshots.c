@@ -1,3 +1,5 @@
+/* Snapshots: saved states of all instances. */
+
 #include "snapshots.h"
 
 #include <stdlib.h>

@@ -1,3 +1,5 @@
+/* An FMU of model exchange and its solver, behind the functions of co-simulation. */
+
 #include "solved.h"
 
 #include <math.h>

@@ -1,3 +1,5 @@
+/* Messages of solvers, and their interruption. */
+
 #include "solver.h"
 
 #include <stdarg.h>

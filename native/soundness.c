@@ -1,3 +1,5 @@
+/* Checks of the memory to which a program refers, before it runs. */
+
 #include "program.h"
 
 static size_t number_of_operands(Instruction i) {

@@ -1,3 +1,5 @@
+/* Starts of episodes: after ended ones in a step, and in a reset. */
+
 #include "starts.h"
 
 #include <math.h>

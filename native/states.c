@@ -1,3 +1,5 @@
+/* States of instances as bytes, which fit any instance of the same FMU. */
+
 #include "states.h"
 
 #include <stdlib.h>

@@ -1,3 +1,5 @@
+/* Steps of one instance, and the reading of its outputs. */
+
 #include "steps.h"
 
 #include <float.h>

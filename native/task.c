@@ -1,3 +1,5 @@
+/* A task of threads: statuses that they note, and observations that they write. */
+
 #include "task.h"
 
 #include "instances.h"

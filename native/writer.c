@@ -1,3 +1,5 @@
+/* Writer of forms. */
+
 #include "writer.h"
 
 #include <stdlib.h>

@@ -20,7 +20,7 @@ from ways import in_python, many
 import fmugym
 from fmugym.errors import ConfigError
 from fmugym.pool.extension import require_engine
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 from fmugym.wine.prefix import Wine
 
 sys.path += [folder for folder in building.FOLDERS if folder not in sys.path]
@@ -171,7 +171,7 @@ def cli(capsys):
     """Call the command line; its exit code, and what it printed to both streams."""
 
     def call(*arguments):
-        code = main(list(map(str, arguments)))
+        code = run_command_line(list(map(str, arguments)))
         return code, *capsys.readouterr()
 
     return call

@@ -17,7 +17,7 @@ from fmugym.episodes import output_files
 from fmugym.episodes.evaluation import Score, plot_scores
 from fmugym.files import replaced, replaced_together, write_whole
 from fmugym.tools import playing
-from fmugym.training import agents, checkpoints, diary, outcome
+from fmugym.training import agents, checkpoints, outcome, training_records
 from fmugym.training.searching import Searching
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
@@ -155,11 +155,11 @@ def test_a_checkpoint(tmp_path, monkeypatch):
 def test_the_curve_and_its_picture(tmp_path):
     pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
     for steps in (1, 2):
-        diary.note(tmp_path, ("steps", "reward"), (steps, 0.5))
+        training_records.append_row(tmp_path, ("steps", "reward"), (steps, 0.5))
     assert outcome.write_curve(tmp_path, "title", print) is not None
     unchanged(tmp_path, lambda: outcome.write_curve(tmp_path, "another", print))
-    unchanged(tmp_path, lambda: diary.note(tmp_path, (), ("x" * ROOM, 0.5)))
-    diary.note(tmp_path, ("steps", "reward"), (3, 0.5))
+    unchanged(tmp_path, lambda: training_records.append_row(tmp_path, (), ("x" * ROOM, 0.5)))
+    training_records.append_row(tmp_path, ("steps", "reward"), (3, 0.5))
     assert (tmp_path / "evaluations.csv").read_text() == "steps,reward\n1,0.5\n2,0.5\n3,0.5\n"
 
 
@@ -175,7 +175,7 @@ def test_a_recording(tmp_path):
     recording = SimpleNamespace(
         **dict.fromkeys(fmugym.recording._ARRAYS, np.random.default_rng(0).random(2000))
     )
-    vars(recording).update(dict.fromkeys(fmugym.recording.FACTS))
+    vars(recording).update(dict.fromkeys(fmugym.recording.METADATA))
     save = fmugym.recording.Recording.save
     unchanged(tmp_path, lambda: save(recording, tmp_path / "episode.npz"))
 

@@ -15,7 +15,7 @@ from test_identification import TRUE, swing
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.distributions import Column, Normal, draw_all
+from fmugym.distributions import DrawnColumn, Normal, draw_all
 from fmugym.fit import fit_logs, write_rows
 from fmugym.logs import PlantLog
 
@@ -94,7 +94,7 @@ class TestPendulum:
     def test_it_shows_how_far_it_is(self, ran, task, tmp_path, monkeypatch):
         counts = []
         shown = contextmanager(lambda total, what, unit: iter([counts.append]))
-        monkeypatch.setattr("fmugym.tools.fitting.progress", shown)
+        monkeypatch.setattr("fmugym.tools.fitting.progress_bar", shown)
         log = write_log(tmp_path / "log.csv")
         ran("fit", task, "--log", log, *NAMES, *START, "--candidates", 5)
         assert counts[0] == 1
@@ -297,7 +297,10 @@ class TestFitted:
         assert again["c"] == values["c"]
 
     def test_columns_that_are_apart_still_belong_together(self):
-        left, right = Column([1.0, 2.0, 3.0], table="t"), Column([10.0, 20.0, 30.0], table="t")
+        left, right = (
+            DrawnColumn([1.0, 2.0, 3.0], table="t"),
+            DrawnColumn([10.0, 20.0, 30.0], table="t"),
+        )
         rng = np.random.default_rng(0)
         for _ in range(20):
             first, _, second = draw_all([left, Normal(0.0, 1.0), right], rng)

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from versions import versions
 
-from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS
 
 ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(
@@ -144,7 +144,7 @@ def test_an_installed_wheel_brings_the_command(wheel_python, tmp_path):
 
 
 def test_the_wheel_holds_the_fmus_byte_for_byte(built):
-    names = [f"{fmi_version}/{model}.fmu" for model, fmi_version in BUNDLED]
+    names = [f"{fmi_version}/{model}.fmu" for model, fmi_version in BUNDLED_FMUS]
     with zipfile.ZipFile(built[1]) as wheel:
         packed = {name: wheel.read(f"fmugym/fmus/{name}") for name in names}
     assert packed == {name: (ROOT / "resources/fmus" / name).read_bytes() for name in names}

@@ -72,7 +72,7 @@ SLOW_MODULES = {
 
 WITHOUT_EXTENSION = {
     "test_clock_shift",
-    "test_declared_parts",
+    "test_declared_expressions",
     "test_declared_tables",
     "test_distributions",
     "test_executable",

@@ -12,7 +12,17 @@ from typing import Any
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.config import CONFIG, FOREIGN
 from fmugym.declared import format as task_format
-from fmugym.keys import REQUIRED, AnyKind, Either, Entries, Key, Kind, Listed, Table, table_of
+from fmugym.keys import (
+    REQUIRED,
+    AnyKind,
+    Either,
+    Entries,
+    Key,
+    Kind,
+    Listed,
+    Table,
+    table_of_fields,
+)
 from fmugym.systems.components import Component
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -22,8 +32,8 @@ SCHEMA = DOCS.parent / "fmugym" / "declared" / "task.schema.json"
 VARIABLE = task_format.VARIABLE.keys
 TABLES = {
     "agent": task_format.AGENT.keys,
-    "archive limits": table_of(ArchiveLimits).keys,
-    "component": table_of(Component).keys,
+    "archive limits": table_of_fields(ArchiveLimits).keys,
+    "component": table_of_fields(Component).keys,
     "config": CONFIG.keys,
     "data": task_format.DATA.keys,
     "device": task_format.DEVICE,

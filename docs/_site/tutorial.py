@@ -20,7 +20,7 @@ from typing import Final
 
 from PIL import Image
 
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 
 IMAGES: Final = Path(__file__).parent.parent / "images"
 
@@ -58,7 +58,7 @@ def printed(commands: Sequence[str]) -> list[str]:
     for command in commands:
         text = io.StringIO()
         with contextlib.redirect_stdout(text), contextlib.redirect_stderr(io.StringIO()):
-            main(shlex.split(command)[1:])
+            run_command_line(shlex.split(command)[1:])
         told = text.getvalue().replace(str(Path.cwd()), "~/house")
         lines += [f"$ {command}", *told.splitlines()]
     return lines

@@ -1,4 +1,4 @@
-"""Reading what is in an FMU file: archive, model description and shared library."""
+"""Reader of an FMU file: archive, model description and shared library."""
 
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU

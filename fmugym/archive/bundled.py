@@ -7,7 +7,7 @@ from pathlib import Path
 from fmugym.checks import check_option, number_of
 from fmugym.errors import ConfigError
 
-__all__ = ["BUNDLED", "FMI_VERSIONS", "MODELS", "bundled_fmu", "is_bundled"]
+__all__ = ["BUNDLED_FMUS", "FMI_VERSIONS", "MODELS", "bundled_fmu", "is_bundled"]
 
 FMI_VERSIONS = ("1.0", "2.0", "3.0")
 """The FMI versions of the bundled FMUs."""
@@ -22,7 +22,9 @@ _VERSIONS = {
 MODELS = tuple(_VERSIONS)
 """The names of the bundled models."""
 
-BUNDLED = tuple((model, version) for model, versions in _VERSIONS.items() for version in versions)
+BUNDLED_FMUS = tuple(
+    (model, version) for model, versions in _VERSIONS.items() for version in versions
+)
 """Each bundled FMU's model and FMI version."""
 
 _PACKAGE = Path(__file__).parent.parent

@@ -1,4 +1,4 @@
-"""Making a ``ModelDescription`` of what FMPy has read, and of the XML where FMPy leaves gaps."""
+"""Conversion of FMPy's model description, and of XML elements that FMPy does not read."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _SHARED: Final = attrgetter(
 """Attributes of FMPy's variables that are the same for many."""
 
 _NOTHING_MORE: Final[Mapping[str, str]] = MappingProxyType({})
-"""In the place of an element of the XML that has nothing but what FMPy reads."""
+"""Stands for an XML element that FMPy reads entirely."""
 
 _OPPOSITES: Final = {"Real", "Integer", "Boolean"}
 """The types of FMI 1.0 whose values can be negated."""
@@ -60,10 +60,10 @@ _ELEMENTS: Final = {"co_simulation": "CoSimulation", "model_exchange": "ModelExc
 
 
 def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescription:
-    """Make a model description.
+    """Convert FMPy's model description to a ``ModelDescription``.
 
     Args:
-        source: What FMPy has read.
+        source: Model description as FMPy reads it.
         root: The root of the XML.
         interface: One of ``INTERFACES``; None for the first of them that the FMU offers.
 
@@ -115,7 +115,7 @@ def _choose(source: Any, interface: str | None) -> tuple[str, Any]:
 
 
 def _with_elements(source: Any, root: Any) -> Iterator[tuple[Any, Any]]:
-    """FMPy's variables with their elements of the XML; aliases of FMI 3.0 have that of another.
+    """Pair FMPy's variables with their XML elements; an alias of FMI 3.0 has its variable's.
 
     Names may come twice.
     """
@@ -165,7 +165,7 @@ def _count(source: Any, attribute: str) -> int:
 
 
 def _units(root: Any) -> dict[str, Unit]:
-    """Read the unit definitions; those with numbers that cannot be used are left out."""
+    """Read the unit definitions; unusable ones are left out."""
     units: dict[str, Unit] = {}
     for element in root.findall("UnitDefinitions/*"):
         name = element.get("unit" if element.tag == "BaseUnit" else "name")
@@ -211,7 +211,7 @@ def _error_categories(root: Any) -> tuple[str, ...]:
 
 
 def _derivatives(source: Any, namesakes: Collection[str]) -> dict[str, str]:
-    """Read the derivatives in ModelStructure, but for those that do not name their states.
+    """Read the derivatives of ModelStructure that name their states.
 
     Where one of the two names is not unique, nobody can use the other one.
     """
@@ -295,7 +295,7 @@ def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
 
 
 def _variables(pairs: Iterable[tuple[Any, Any]]) -> list[Variable]:
-    """Convert the variables; only one of those that differ in nothing but ``OWN`` takes time."""
+    """Convert the variables; only one of a group that differs in ``OWN`` alone takes time."""
     templates: dict[Any, Variable] = {}
     variables = []
     for source, element in pairs:
@@ -366,7 +366,7 @@ def _ticking(source: Any, element: Any) -> str:
 
 
 def _shift(source: Any, element: Any, ticking: str) -> Interval:
-    """The time before the first tick. Only the FMU knows that of a calculated clock."""
+    """Time before the first tick; the FMU alone knows it for a calculated clock."""
     shift = _clock_time(source, element, "shift")
     return Interval(0.0) if shift is UNKNOWN and ticking != "calculated" else shift
 

@@ -1,4 +1,4 @@
-"""The shared libraries and tools that an FMU needs, looked for before the FMU is loaded."""
+"""Dependencies of an FMU: shared libraries and tools that it needs, checked before loading."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class _Needed(NamedTuple):
 
     Attributes:
         name: Its name.
-        path: Where it is among the files of the FMU, or None.
+        path: Path among the files of the FMU, or None.
         found: Whether the loader finds it there.
     """
 
@@ -100,7 +100,7 @@ def ask_in_a_child(names: Sequence[str]) -> list[str]:
 
 
 def stray_libraries(library: Path) -> list[Path]:
-    """Find libraries that an FMU brings along in a folder where the loader does not look.
+    """Find libraries of an FMU in folders that the loader does not search.
 
     Args:
         library: The FMU's library, extracted.
@@ -125,7 +125,7 @@ def calls_python(library: Path) -> bool:
 
 
 def libraries_of(library: Path) -> list[Path]:
-    """The library, and those that it needs and finds among the files of its FMU."""
+    """The library of an FMU, and the libraries that it needs among the FMU's files."""
     return [library, *(needed.path for needed in _needed(library) if needed.path)]
 
 
@@ -207,14 +207,14 @@ def missing_tool(generation_tool: str, needs_execution_tool: bool) -> str | None
 
 
 def note_on(library: str) -> str:
-    """What to do about a library that is missing, beyond installing it; empty for most."""
+    """Advice on a missing library beyond its installation; empty for most."""
     if re.fullmatch(r"libgfortran\.so\.[34]", library):
         return "no current distribution has it; 'fmugym info --repair FMU' makes a replacement"
     return ""
 
 
 def describe_missing(fmu: str, libraries: Sequence[str]) -> str:
-    """Say which libraries an FMU of this name misses, and what to do about it."""
+    """Describe the missing libraries of an FMU, and the cure."""
     notes = ((name, note_on(name)) for name in libraries)
     listing = "; ".join(f"{name} ({note})" if note else name for name, note in notes)
     return (

@@ -1,4 +1,4 @@
-"""What an FMU says of itself, in one form for the three FMI versions.
+"""Model description of an FMU, in one form for the three FMI versions.
 
 ``fmugym.archive.reading`` makes these types from an FMU's XML.
 """
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
-"""What the dimension of a unit has exponents of."""
+"""SI base units of which the dimension of a unit has exponents."""
 
 INTERFACES = ("co_simulation", "model_exchange")
 """The interfaces by which an FMU may be run, the preferred one first."""
@@ -37,11 +37,11 @@ INTERFACES = ("co_simulation", "model_exchange")
 _LARGEST_SIZE: Final = 2**31 - 1
 
 _ELEMENT: Final = re.compile(r"(.+)\[(\d{1,9}(?:, ?\d{1,9})*)\]")
-"""The name of an element: that of its array, and its indices."""
+"""Pattern of the name of an element: the array's name, and indices."""
 
 
 def _whole(value: Any) -> int | None:
-    """Return a number as an int if it is whole, also if it is a float, as those of files are."""
+    """Return a whole number as an int, also if it is a float."""
     return int(value) if isinstance(value, float) and value.is_integer() else integer_of(value)
 
 
@@ -74,7 +74,7 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class ModelExchange:
-    """What a solver needs to know of the equations of an FMU.
+    """Facts about an FMU's equations that a solver needs.
 
     Attributes:
         number_of_states: Continuous states.
@@ -127,13 +127,13 @@ class ModelDescription:
     """The part of a model description that an environment needs.
 
     Attributes:
-        model_identifier, capabilities: Those of the interface in use.
+        model_identifier, capabilities: Identifier and capabilities of the interface in use.
         interfaces: The interface types that the FMU offers.
         interface: The one in use, one of ``INTERFACES``.
-        model_exchange: What a solver needs; None in co-simulation.
+        model_exchange: Facts for a solver; None in co-simulation.
         start_time, stop_time, step_size, fixed_internal_step_size: In seconds; None where the FMU
             gives no usable value.
-        tolerance: Of the default experiment; None where the FMU gives no usable value.
+        tolerance: Tolerance of the default experiment; None where the FMU gives no usable value.
         variables: The variables by name, in the order of the XML, but for the ``namesakes``.
         namesakes: The variables of each name that is not unique, which cannot be used.
         derivatives: For each continuous state that the FMU declares, a scalar or an array, the name
@@ -176,7 +176,7 @@ class ModelDescription:
 
     @cached_property
     def everything(self) -> tuple[Variable, ...]:
-        """The variables with those whose names are not unique."""
+        """All variables, also those whose names are not unique."""
         others = (variable for several in self.namesakes.values() for variable in several)
         return (*self.variables.values(), *others)
 
@@ -215,14 +215,14 @@ class ModelDescription:
 
     @cached_property
     def clocks(self) -> tuple[Variable, ...]:
-        """The clocks that tick; none where neither the pool nor model exchange has events."""
+        """Clocks that tick; none if neither the pool nor model exchange has events."""
         if not self.uses_event_mode and self.model_exchange is None:
             return ()
         return tuple(v for v in self.everything if v.ticking and not v.shape)
 
     @property
     def clocked_inputs(self) -> tuple[Variable, ...]:
-        """The inputs that may be set only while one of their clocks ticks."""
+        """Inputs that may be set only at a tick of one of their clocks."""
         known = {clock.value_reference for clock in self.clocks}
         inputs = (v for v in self.everything if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
@@ -233,7 +233,7 @@ class ModelDescription:
 
     @cached_property
     def arrays_beside_clocked(self) -> tuple[Variable, ...]:
-        """The arrays that may be set in steps, but without clocks, where some inputs have these."""
+        """Arrays without clocks that steps set, if other inputs have clocks."""
         if not self.clocked_inputs:
             return ()
         clocked = {variable.name for variable in self.clocked_inputs}
@@ -281,7 +281,7 @@ class ModelDescription:
         return array.elements[place]
 
     def require_unique(self, name: Any) -> None:
-        """Require that a name is not that of several variables.
+        """Require that only one variable has a name.
 
         Raises:
             ConfigError: If it is.
@@ -361,7 +361,7 @@ class ModelDescription:
         return number
 
     def find(self, name: str) -> Variable | None:
-        """Do what ``variable`` does, but return None if there is no such variable.
+        """Return a variable as ``variable`` does, but None for an unknown name.
 
         Raises:
             ConfigError: If there are several.

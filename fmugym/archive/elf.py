@@ -1,4 +1,4 @@
-"""What the headers of an ELF library say: the format of Linux, 64 bits, little-endian.
+"""Headers of ELF libraries: the format of Linux, 64 bits, little-endian.
 
 Sources: System V ABI, "Object Files" and "Dynamic Linking"; the Linux Standard Base, "Symbol
 Versioning"; ld.so(8). The project reads ELF by itself because the usual libraries for it raise

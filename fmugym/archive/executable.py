@@ -1,4 +1,4 @@
-"""Which system and processor a shared library was built for, told before it is loaded.
+"""Operating system and processor of a shared library, read before it is loaded.
 
 The loaders of most systems answer a library of another processor with a misleading text ("No such
 file", "Windows error 193"), and Linux ends the process when a library is cut short. The formats:

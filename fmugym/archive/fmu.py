@@ -1,4 +1,4 @@
-"""An FMU file: it is opened once, checked, extracted to its own folder and cleaned up.
+"""FMU file: opened once, checked, extracted to a folder of its own, and cleaned up.
 
 Reading the description never executes the FMU. Loading it (``fmugym.pool``) does: an FMU is native
 code that runs with all the rights of the process.
@@ -82,7 +82,7 @@ _MOST_FINDINGS: Final = 20
 
 @runtime_checkable
 class StandsForFMU(Protocol):
-    """What can be opened like an FMU, such as a system of FMUs."""
+    """Interface of an FMU and of its substitutes, such as a system."""
 
     def as_fmu(self) -> FMU:
         """Open it, with a temporary folder of its own."""
@@ -93,7 +93,7 @@ class FMU(KnownArguments):
 
     Args:
         path: The ``.fmu`` file.
-        limits: What is too large to be opened; by default ``ArchiveLimits()``.
+        limits: Limits of the size of an archive; by default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's, which may need them: paths, or names
             that the system's loader finds.
         probe_timeout: Seconds that a call of an unknown FMU may take in a trial in a process of its
@@ -180,7 +180,7 @@ class FMU(KnownArguments):
         return None if wanted is None else _find_library(list(self._archive.files), wanted)
 
     def _wanted_library(self) -> str | None:
-        """The library's place in the folder for this machine, or in that of another FMI version.
+        """Path of the library for this machine, or of another FMI version's.
 
         None if neither has a library.
         """
@@ -241,7 +241,7 @@ class FMU(KnownArguments):
 
     @property
     def content(self) -> str:
-        """The SHA-256 of the file, or that of a system: of its plan and its files."""
+        """SHA-256 of the file; for a system, of its plan and files."""
         return file_digest(self.path)
 
     def variable(self, name: str) -> Variable:
@@ -250,7 +250,7 @@ class FMU(KnownArguments):
 
     @cached_property
     def feedthrough(self) -> Feedthrough:
-        """Which inputs act on which outputs at once, as the model description tells it.
+        """Direct feed-through: the inputs that act at once on each output, by the XML.
 
         Raises:
             FMULoadError: If the archive has been changed or removed.
@@ -270,7 +270,7 @@ class FMU(KnownArguments):
 
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
-        """What keeps the FMU from being loaded on this machine, as texts with the cure.
+        """Reasons why the FMU cannot be loaded on this machine, as texts with the cure.
 
         There is no library for this platform or processor, or it needs Wine or shared libraries
         that are missing here. Nothing of the FMU is loaded.
@@ -312,7 +312,7 @@ class FMU(KnownArguments):
         return tuple(missing_libraries(folder / self.library, self.preload, ask_in_a_child))
 
     def parts_in(self, folder: Path) -> Sequence[tuple[FMU, Path]]:
-        """The FMUs of a system, or this one, and where each is in a folder like ``extract``'s."""
+        """FMUs of a system, or this one, with the place of each in a folder like ``extract``'s."""
         return [(self, folder)]
 
     def libraries_in(self, folder: Path) -> list[tuple[FMU, Path]]:
@@ -324,7 +324,7 @@ class FMU(KnownArguments):
         return any(calls_python(path) for _, path in self.libraries_in(self.extract()))
 
     def libraries_before(self, folder: Path) -> list[tuple[str, str]]:
-        """The libraries to load before those of the FMUs.
+        """Libraries to load before the libraries of the FMUs.
 
         Args:
             folder: As for ``libraries_in``.
@@ -346,7 +346,7 @@ class FMU(KnownArguments):
     def require_libraries(
         self, folder: Path, ask: Callable[[Sequence[str]], list[str]] = ask_in_a_child
     ) -> None:
-        """Require that the loader finds all libraries that those of the FMUs need.
+        """Require that the loader finds all libraries that the FMUs need.
 
         Args:
             folder: As for ``libraries_in``.
@@ -400,7 +400,7 @@ class FMU(KnownArguments):
         return f"binaries/{self.platform}/{self.description.model_identifier}{suffix}"
 
     def extract(self) -> Path:
-        """Extract what this machine needs into a temporary folder.
+        """Extract the files for this machine to a temporary folder.
 
         The folder is removed by ``close``, with this object, or at the end of the interpreter.
         Later calls extract anew what a cleaner of temporary files has removed meanwhile.
@@ -433,7 +433,7 @@ class FMU(KnownArguments):
         return self._folder is not None
 
     def _extract_again(self, folder: Path) -> None:
-        """Extract what is missing in the folder."""
+        """Extract files that are missing in the folder."""
         if not folder.exists():
             make_folder(folder)
         elif not is_own(folder):
@@ -456,7 +456,7 @@ class FMU(KnownArguments):
             check_library(file, size, f"{self.path.name}: {place}")
 
     def _no_library(self) -> str:
-        """Say which library is missing, and what there is instead."""
+        """Describe the missing library, and the ones that the FMU has."""
         wanted = self._wanted_library() or self.library
         folder, _, name = wanted.rpartition("/")
         there = [p.rpartition("/")[2] for p in _libraries_in(list(self._archive.files), wanted)]
@@ -485,7 +485,7 @@ class FMU(KnownArguments):
         """Extract the files that are needed and not there; returns whether there are any.
 
         Args:
-            folder: Where to.
+            folder: Target folder.
             only: The one folder of the archive whose files are needed; by default several are.
         """
         files = {p: self._target(p) for p in self._archive.files if self._needed(p, only)}
@@ -514,7 +514,7 @@ class FMU(KnownArguments):
         return first not in _NEVER_NEEDED
 
     def _target(self, place: str) -> str:
-        """Where a file is extracted to: the library gets its standard name."""
+        """Path to which a file is extracted; the library gets its standard name."""
         if place == self._library_place:
             return self.library
         first, _, rest = place.partition("/")

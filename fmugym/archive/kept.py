@@ -1,4 +1,4 @@
-"""Model descriptions in the cache folder: large ones take seconds to parse, at every construction.
+"""Cache of model descriptions: large ones take seconds to parse at each construction.
 
 A file holds JSON behind a checksum, which takes less time to write than to compress. What is
 damaged, or was written by another version of this package, is as good as missing, and so is a
@@ -40,7 +40,7 @@ _SIMPLE: Final = tuple(
 
 
 def kept(key: str) -> ModelDescription | None:
-    """Read what was kept under a key; None if there is nothing, or nothing sound."""
+    """Read the value of a key from the cache; None if there is no sound one."""
     try:
         content = read_file(cache_folder(_FOLDER) / _name(key), _LARGEST)
         digest, text = content[:32], content[32:]
@@ -95,7 +95,7 @@ def _plain(description: ModelDescription) -> dict[str, Any]:
 
 
 def _table(variables: Iterable[Variable]) -> dict[str, Any]:
-    """What each variable has of its own, and the number of what it shares with its siblings."""
+    """Own values of each variable, and the number of the values that its siblings share."""
     rows = list(variables)
     each = [variable.shared for variable in rows]
     shared = {id(one): one for one in each}
@@ -137,7 +137,7 @@ def _template_of(shared: dict[str, Any]) -> Variable:
 
 
 def _time_of(time: Sequence[Any]) -> Interval:
-    """A time of a clock. One that only the FMU knows is always the same object."""
+    """Read a time of a clock; ``UNKNOWN`` for one that only the FMU knows."""
     made = Interval(*time)
     return UNKNOWN if math.isnan(made.seconds) else made
 

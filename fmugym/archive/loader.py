@@ -1,4 +1,4 @@
-"""Asking the system's loader for shared libraries.
+"""Loader of the system, asked for shared libraries.
 
 Run as a program it answers for another process: it reads a list of names as JSON, and prints those
 that are missing. It imports nothing but the standard library, so that it starts in 20 ms.

@@ -1,4 +1,4 @@
-"""Reading ``modelDescription.xml`` in bounded memory and time, whatever the file holds.
+"""Reader of ``modelDescription.xml`` in bounded memory and time, whatever the file has.
 
 Nothing is parsed before its size, its encoding and the amount of its markup are known: a short file
 can unpack to gigabytes, and each element takes a quarter of a kilobyte once it is parsed.
@@ -28,7 +28,7 @@ __all__ = ["parse_xml", "read_model_description", "read_root", "read_xml"]
 
 _XML: Final = "modelDescription.xml"
 _LARGE: Final = 2**18
-"""From so many bytes on, what was read is kept in the cache folder: some thousand variables."""
+"""Size in bytes of XML that is kept in the cache folder once parsed: some thousand variables."""
 
 _MARKUP_PER_VARIABLE: Final = 25
 """Elements and attributes that a file may have for each of ``max_variables``."""
@@ -54,7 +54,7 @@ _LEFT_OUT_BY_FMPY: Final = (
     b"intervalVariability",
     b"<UInt",
 )
-"""Where variables have none of this, ``convert`` needs nothing of them that FMPy does not read."""
+"""Marks of variables of which ``convert`` needs more than FMPy reads."""
 
 _ENCODINGS: Final = re.compile(r"utf-?8|(us-)?ascii|iso-?8859-\d+|(windows-|cp)125\d", re.I)
 """Encodings in which neither ``<`` nor ``=`` can hide. FMI 2.0 and 3.0 ask for UTF-8."""
@@ -185,7 +185,7 @@ def read_xml(archive: SafeZip, place: str, limit: int) -> bytes:
 
 
 def _hint(archive: SafeZip) -> str:
-    """Name the mistake of those who pack a folder instead of what is in it."""
+    """Explain the mistake of packing a folder instead of its content."""
     inside = next((p for p in archive.files if p.endswith(f"/{_XML}") and p.count("/") == 1), None)
     if inside is None:
         return ""
@@ -221,7 +221,7 @@ def _encoding_of(content: bytes) -> str:
 
 
 def _without_dependencies(content: bytes) -> bytes:
-    """Leave out on what the unknowns depend.
+    """Leave out the dependencies of the unknowns.
 
     No environment needs it, and FMPy makes millions of objects of a few megabytes of numbers. Line
     breaks stay, since findings have the numbers of lines.
@@ -234,7 +234,7 @@ def _without_dependencies(content: bytes) -> bytes:
 
 
 def _without_plain_variables(content: bytes, limits: ArchiveLimits) -> bytes:
-    """Leave out the variables, unless they have what FMPy does not read.
+    """Leave out all variables, unless one has elements that FMPy does not read.
 
     FMPy parses them in any case, and twice takes much time and memory. They stay where it is not
     sure where they begin and end, and where there may be too many, which are counted before FMPy
@@ -256,7 +256,7 @@ def parse_xml(name: str, place: str, content: bytes) -> Any:
     Args:
         name: The name of the archive, for errors.
         place: The place of the file, for errors.
-        content: What ``read_xml`` returned.
+        content: Result of ``read_xml``.
 
     Returns:
         The root, an element of lxml.
@@ -272,7 +272,7 @@ def parse_xml(name: str, place: str, content: bytes) -> Any:
 
 
 def _parse_with_fmpy(content: bytes) -> Any:
-    """Hand FMPy an archive with nothing but the XML: what it reads is what was checked."""
+    """Let FMPy read an archive of the checked XML alone."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr(_XML, content)

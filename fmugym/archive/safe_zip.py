@@ -39,7 +39,7 @@ _ZIP_ERRORS: Final = (
     zipfile.BadZipFile,
     zlib.error,
 )
-"""What Python's zipfile raises for a damaged archive."""
+"""Errors of Python's zipfile for a damaged archive."""
 
 _METHODS: Final = {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
 _ENCRYPTED: Final = 1
@@ -61,7 +61,7 @@ _has_devices = sys.platform == "win32"
 
 @dataclass(frozen=True)
 class ArchiveLimits(KnownArguments):
-    """How large an FMU may be before it is refused unread; see docs/reliability.md for the limits.
+    """Limits of the size of an FMU, checked before it is read; see docs/reliability.md.
 
     Raises:
         ConfigError: If a limit is not a positive integer.
@@ -95,14 +95,14 @@ class SafeZip:
 
     Args:
         path: The archive.
-        limits: What is too large.
+        limits: Limits of sizes.
 
     Attributes:
         path, limits: As given.
         files: zipfile's record of each file, by its place: a relative path with slashes, inside of
             the folder to which the archive is extracted.
         folders: The places of the folders that have an entry of their own.
-        notes: What was untidy, as texts.
+        notes: Descriptions of untidy places.
 
     Raises:
         FMULoadError: If it is no zip archive, too large, or not sound.
@@ -160,7 +160,7 @@ class SafeZip:
             self.files[place] = entry
 
     def _prefers(self, place: str, entry: zipfile.ZipInfo) -> bool:
-        """Choose among files of one place as zipfile does: the exact name, of those the last."""
+        """Choose among files of one place as zipfile does: the last one of the exact name."""
         other = self.files.get(place)
         if other is None:
             return True
@@ -222,7 +222,7 @@ class SafeZip:
             self.files[place] = copy.copy(self.files[target])
 
     def _check_folders(self) -> None:
-        """Find files where a folder has to be, and places that are one place on this system.
+        """Find files in the place of folders, and places that this system takes for one.
 
         Some tools leave out the slash at the end of a folder's name. Such an entry is empty.
         """
@@ -284,7 +284,7 @@ class SafeZip:
         """Write files and folders.
 
         Args:
-            folder: Where to write.
+            folder: Target folder.
             files: The place in ``folder`` of each file, by its place in the archive.
             folders: Places in ``folder`` of folders to make, which may stay empty.
 
@@ -317,7 +317,7 @@ class SafeZip:
 
 
 def _version_of(path: Path) -> tuple[int, int]:
-    """What changes when somebody writes another file to a path."""
+    """Identity of the file at a path, which changes when another one is written there."""
     status = path.stat()
     return status.st_mtime_ns, status.st_size
 
@@ -367,11 +367,11 @@ def _what_is_there(path: Path) -> str:
 
 
 def check_limit(found: str, value: int, limit: int, name: str) -> None:
-    """Refuse what is too large.
+    """Refuse a size above a limit.
 
     Args:
-        found: What was found, with the name of the FMU.
-        value: How large it is.
+        found: Description of the file, with the name of the FMU.
+        value: Its size.
         limit: The limit.
         name: The attribute of ``ArchiveLimits`` that sets the limit.
 

@@ -1,4 +1,4 @@
-"""Which inputs of an FMU act on which outputs at once: direct feed-through, as the XML tells it."""
+"""Model structure of an FMU: direct feed-through from inputs to outputs, by the XML."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def read_feedthrough(root: Any, description: ModelDescription) -> Feedthrough:
 
     Args:
         root: The root of the XML.
-        description: What has been read of it.
+        description: Variables that have been read.
     """
     inputs = frozenset(_named(description, "input"))
     outputs = list(_named(description, "output"))
@@ -66,7 +66,7 @@ def _named(description: ModelDescription, causality: str) -> Iterator[str]:
 def _completed(
     outputs: Iterable[str], told: Mapping[str, list[str] | None], inputs: frozenset[str]
 ) -> dict[str, frozenset[str]]:
-    """Leave what is no input: states and parameters do not matter here."""
+    """Dependencies on inputs alone; an output without an entry depends on all of them."""
     found = ((name, told.get(name)) for name in outputs)
     return {name: inputs if on is None else inputs.intersection(on) for name, on in found}
 

@@ -1,4 +1,4 @@
-"""Temporary folders with their owner in the name, so that those of killed processes can go."""
+"""Temporary folders named after their process, so that those of killed processes can go."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Final
 from fmugym.caching import own_prefix, sweep
 from fmugym.errors import FMULoadError
 
-__all__ = ["folder_name", "is_plain", "make_folder", "remove_folder", "remove_rest"]
+__all__ = ["folder_name", "is_plain_path", "make_folder", "remove_folder", "remove_rest"]
 
 _made_in: Final[dict[Path, str]] = {}
 """The working directory at the time when each folder was made."""
@@ -30,11 +30,11 @@ _OTHER_ROOTS: Final = (
     if sys.platform == "win32"
     else ("/tmp", "/var/tmp", "/dev/shm")
 )
-"""Where all users may make folders."""
+"""Folders in which all users may make folders."""
 
 
 def folder_name() -> Path:
-    """A name for a temporary folder of this process, after a first look for those of dead ones.
+    """Name a temporary folder of this process, after a first look for folders of dead ones.
 
     There is no such folder yet. So the caller can see to its removal before it makes it, and no
     signal comes in between.
@@ -56,11 +56,11 @@ def _root() -> Path:
     Many FMUs do not decode the URI of their resources, or have little room for paths.
     """
     usual = Path(tempfile.gettempdir())
-    others = _OTHER_ROOTS if not is_plain(usual) else ()
+    others = _OTHER_ROOTS if not is_plain_path(usual) else ()
     return next((Path(root) for root in others if _is_usable(root)), usual)
 
 
-def is_plain(path: Path) -> bool:
+def is_plain_path(path: Path) -> bool:
     """Whether a path is short, and its URI has it as it is: no spaces, no special letters."""
     return bool(_PLAIN.fullmatch(str(path)))
 
@@ -70,7 +70,7 @@ def _is_usable(root: str) -> bool:
     if not os.path.isdir(root) or not os.access(root, os.W_OK | os.X_OK):
         return False
     mounted = os.statvfs(root).f_flag if hasattr(os, "statvfs") else 0
-    return is_plain(Path(root)) and not mounted & getattr(os, "ST_NOEXEC", 0)
+    return is_plain_path(Path(root)) and not mounted & getattr(os, "ST_NOEXEC", 0)
 
 
 def make_folder(folder: Path) -> None:

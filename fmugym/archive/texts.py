@@ -1,4 +1,4 @@
-"""Numbers in the place of the texts that Strings start with.
+"""Numbers that stand for the start values of Strings.
 
 Between the draws and an FMU all start values are float64. A String holds the texts that it may get
 as items, as an Enumeration does; the number of a text is its place among them. It means nothing
@@ -81,7 +81,7 @@ def texts_at(texts: Texts, numbers: Any) -> Any:
 def values_by_name(
     variables: Iterable[Variable], numbers: Iterable[float]
 ) -> dict[str, float | str]:
-    """The values of variables by name, those of Strings as texts."""
+    """Values of variables by name, with texts for Strings."""
     return {
         variable.name: variable.items[int(number)][0] if variable.kind == "string" else number
         for variable, number in zip(variables, numbers, strict=True)

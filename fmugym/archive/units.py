@@ -183,7 +183,7 @@ def _conversion_by_pint(
 
 
 def _known(name: str, definitions: Mapping[str, Unit]) -> tuple[Any, Conversion]:
-    """A unit of pint, and the conversion to it: what pint does not know is defined by SI units."""
+    """A unit of pint and the conversion to it; SI units define a unit that pint does not know."""
     try:
         return _parsed(name), IDENTITY
     except ConfigError:
@@ -210,7 +210,7 @@ _HARMLESS: Final = re.compile(r"(?!.*\*\*)(\b[^\W\d]\w*\b|\b1\b|\W){0,200}")
 
 
 def _parsed(name: str) -> Any:
-    """A unit in the way of writing of Modelica and FMI, where ``.`` multiplies: ``W/(m2.K)``."""
+    """Parse a unit as Modelica and FMI write it, where ``.`` multiplies: ``W/(m2.K)``."""
     text = re.sub(r"(?<=[A-Za-z%])(-?\d+)", r"**(\1)", name.replace(".", "*"))
     text = re.sub(r"(?<=[\w)])\^", "**", text).replace("%", "percent")
     try:

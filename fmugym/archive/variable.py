@@ -63,14 +63,15 @@ CLOCK_KINDS = (
     "countdown",
     "triggered",
 )
-"""The interval variabilities of clocks. Those before the last one have ticks of their own."""
+"""Interval variabilities of clocks; all but the last one have ticks of their own."""
 
 MOST_FRACTIONS: Final = 2**52
 """The largest counter and resolution of an interval: float64 can hold a few of them exactly."""
 
 
 OWN: Final = ("name", "value_reference", "start", "description")
-"""The attributes in which most variables differ: what ``Variable.sibling`` takes, in its order."""
+"""Attributes in which most variables differ, in the order in which ``Variable.sibling`` takes
+them."""
 
 
 class Interval(NamedTuple):
@@ -160,7 +161,7 @@ class Variable:
 
     @cached_property
     def shared(self) -> Mapping[str, Any]:
-        """The attributes by name, but for those that ``sibling`` takes; siblings have the same."""
+        """Attributes by name that siblings share, all but the ones that ``sibling`` takes."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in OWN}
 
     def sibling(
@@ -181,12 +182,12 @@ class Variable:
 
     @cached_property
     def _attributes(self) -> Mapping[str, Any]:
-        """What ``sibling`` copies: all attributes, and ``shared``, which need not be made again."""
+        """Attributes that ``sibling`` copies, and ``shared``, which need not be made again."""
         return {f.name: getattr(self, f.name) for f in fields(self)} | {"shared": self.shared}
 
     @cached_property
     def kind(self) -> str:
-        """One of real, integer, boolean, enumeration, string and binary.
+        """Kind of the type: real, integer, boolean, enumeration, string or binary.
 
         A clock is a Boolean: whether it ticks.
         """
@@ -207,7 +208,7 @@ class Variable:
 
     @property
     def is_number(self) -> bool:
-        """Whether float64 can hold its value, or those of its elements."""
+        """Whether float64 can hold the value, or the values of the elements."""
         return self.kind in {"real", "integer", "boolean", "enumeration"}
 
     @property
@@ -256,7 +257,7 @@ class Variable:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Minimum and maximum that mean something; infinite where they do not.
+        """Minimum and maximum that mean something; infinite for others.
 
         Some exporters write the largest number, or the same one twice, where there is none.
         """
@@ -294,7 +295,7 @@ class Variable:
 
     @property
     def is_apart(self) -> bool:
-        """Whether it is an element that is got and set by itself, as those of systems are."""
+        """Whether it is an element that is got and set by itself, as elements of systems are."""
         return self.array is not None and self.array.driven is not None
 
     @cached_property
@@ -331,7 +332,7 @@ class Variable:
         return tuple(elements if self.driven is None else map(self._apart, elements))
 
     def _apart(self, element: Variable) -> Variable:
-        """The element of an array of a system. What something else drives cannot be set."""
+        """Element of an array of a system; a driven one cannot be set."""
         assert self.driven is not None
         reference = self.value_reference + element.place
         alone = replace(element, value_reference=reference, place=0)
@@ -340,7 +341,7 @@ class Variable:
         return replace(alone, causality="local", initial=None)
 
     def _starts_of(self, count: int) -> list[str | None]:
-        """The start value of each element; all of them where their number is wrong."""
+        """Start value of each element; all of them where their number is wrong."""
         texts = (self.start or "").split()
         return [*texts] if len(texts) == count else [self.start] * count
 
@@ -410,7 +411,7 @@ def _check_integer(variable: Variable, number: float) -> None:
 
 
 def unlisted(variables: Sequence[Variable]) -> list[Variable]:
-    """Find what is missing of arrays of which only some elements are listed.
+    """Find missing elements of arrays of which some elements are listed.
 
     FMI moves whole arrays only. Elements that are not listed keep their start values.
     """

@@ -1,4 +1,4 @@
-"""Controllers that need no training: what a trained agent has to beat.
+"""Controllers that need no training, as baselines for trained agents.
 
 Each is made without an environment and bound to one or to many::
 

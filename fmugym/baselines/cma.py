@@ -9,9 +9,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.pool.base import FloatArray
+
 __all__ = ["CMA", "MOST_CORRELATED"]
 
-FloatArray = npt.NDArray[np.float64]
 
 MOST_CORRELATED: Final = 200
 """More numbers than these are searched without covariances."""
@@ -71,7 +72,7 @@ class CMA:
         self._usual_length = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
 
     def state(self) -> dict[str, Any]:
-        """What the next round follows from: numbers and arrays by name."""
+        """State of the search, from which the next round follows: numbers and arrays by name."""
         return {"population": self._shape[0], **{name: getattr(self, name) for name in _STATE}}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -117,7 +118,7 @@ class CMA:
         self.sigma = min(growth * self.sigma * self._adapted(best), sigma)
 
     def _adapted(self, best: FloatArray) -> float:
-        """Learn the covariance, and find what turns normal numbers into steps.
+        """Adapt the covariance, and factorize it for the next steps.
 
         Returns:
             The size of steps, by which they are divided; else it would grow beside ``sigma``.

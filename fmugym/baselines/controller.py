@@ -1,4 +1,4 @@
-"""What all controllers share: how they are bound to environments, and the shapes of actions."""
+"""Base class of controllers: binding to environments, and shapes of actions."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from fmugym.baselines.measuring import Formula, formula_of, of_columns
 from fmugym.checks import KnownArguments, Spellings, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.expressions.value import Value, where
+from fmugym.pool.base import FloatArray
 
 __all__ = [
     "Controller",
-    "FloatArray",
-    "Numbers",
-    "Signal",
+    "NumberOrArray",
+    "SignalReference",
     "attribute_of",
-    "check_numbers",
+    "checked_numbers",
     "either",
     "limited",
     "require_physical",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 
-Numbers = float | FloatArray
+NumberOrArray = float | FloatArray
 """A number, or an array of shape (N,) with one for each environment."""
 
-Signal = str | Numbers
+SignalReference = str | NumberOrArray
 """An element of the observation by name, an expression of them, or a constant."""
 
 
@@ -111,7 +110,7 @@ class Controller(KnownArguments, ABC):
         """Choose actions.
 
         Args:
-            observation: Of shape (k,), or (N, k) for a vector environment.
+            observation: Observation of shape (k,), or (N, k) for a vector environment.
             info: The infos that came with it; no controller of this package reads them.
 
         Returns:
@@ -126,17 +125,17 @@ class Controller(KnownArguments, ABC):
         return actions if self._is_vector else actions[0]
 
     def reset(self, mask: npt.NDArray[np.bool_] | None = None) -> None:
-        """Begin new episodes; call it where ``terminated`` or ``truncated`` was true.
+        """Begin new episodes in environments whose ``terminated`` or ``truncated`` was true.
 
         Args:
             mask: Which environments begin one, shape (N,); by default all.
         """
         self._forget(np.ones(self.count, dtype=bool) if mask is None else np.asarray(mask))
 
-    # What a controller adds.
+    # Methods of each controller.
 
     def _prepare(self) -> None:
-        """Find what the controller needs in the space and the names."""
+        """Find the needed elements of the space and of the names."""
 
     @abstractmethod
     def _decide(self, rows: FloatArray) -> FloatArray:
@@ -146,7 +145,7 @@ class Controller(KnownArguments, ABC):
         """Forget the episodes of some environments."""
 
     def add(self, added: FloatArray) -> None:
-        """Tell the controller what is added to its last decision, once that is limited.
+        """Tell the controller a correction that was added to its last decision, after the limits.
 
         An integral does not grow while the sum is at a limit.
 
@@ -165,7 +164,7 @@ class Controller(KnownArguments, ABC):
         Args:
             observation: Its elements, as float64.
             memory: The numbers that it remembers.
-            added: What is added to the elements of the action, see ``add``.
+            added: Correction of the elements of the action, see ``add``.
 
         Returns:
             The elements of the action, before they are limited, and the numbers that it remembers
@@ -180,7 +179,7 @@ class Controller(KnownArguments, ABC):
         )
 
     def _names_of(self, env: Any) -> tuple[str, ...]:
-        """The names of what the environment lets observe."""
+        """Names of the elements of the environment's observation."""
         names: tuple[str, ...] | None = attribute_of(env, "observation_names")
         if names is None:
             raise ConfigError(
@@ -202,7 +201,7 @@ class Controller(KnownArguments, ABC):
 
     # Shared by controllers.
 
-    def _value(self, seen: Sequence[Any], signal: Signal) -> Any:
+    def _value(self, seen: Sequence[Any], signal: SignalReference) -> Any:
         """The value of a signal.
 
         Args:
@@ -214,10 +213,10 @@ class Controller(KnownArguments, ABC):
         formula, evaluate = self._signals[signal]
         return formula(seen) if isinstance(seen[0], Value) else evaluate(seen)
 
-    def _check_signal(self, what: str, signal: Signal) -> None:
+    def _check_signal(self, what: str, signal: SignalReference) -> None:
         """Check a signal; one that is no name may be an expression."""
         if not isinstance(signal, str):
-            self._check_size(what, check_numbers(what, signal))
+            self._check_size(what, checked_numbers(what, signal))
         elif signal.isidentifier() or self._is_name(signal):
             self._check_name(what, signal)
             element = itemgetter(self._place_of(signal))
@@ -243,7 +242,7 @@ class Controller(KnownArguments, ABC):
             return self.names.index(name)
         return self.names.index(str(Spellings("observation", self.names).find(name)))
 
-    def _check_size(self, what: str, numbers: Numbers | None) -> None:
+    def _check_size(self, what: str, numbers: NumberOrArray | None) -> None:
         """Check that an array has one number for each environment."""
         size = np.size(numbers) if np.ndim(numbers) else self.count  # type: ignore[arg-type] # None is a scalar, too
         if size != self.count:
@@ -297,7 +296,7 @@ class Controller(KnownArguments, ABC):
 
 
 def limited(values: Any, low: Any, high: Any) -> Any:
-    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers.
+    """Limit values as ``numpy.clip`` does, in less time for up to some hundred numbers.
 
     Formulas are limited alike.
     """
@@ -305,14 +304,14 @@ def limited(values: Any, low: Any, high: Any) -> Any:
 
 
 def either(condition: Any, first: Any, second: Any) -> Any:
-    """Do what ``numpy.where`` does, of formulas, too."""
+    """Choose between values as ``numpy.where`` does, of formulas, too."""
     if isinstance(condition, Value):
         return where(condition, first, second)
     return np.where(condition, first, second)
 
 
-def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:
-    """Return a number as a float, or those of a one-dimensional array as floats.
+def checked_numbers(what: str, value: Any, **limits: Any) -> NumberOrArray:
+    """Return a number as a float, or a one-dimensional array of floats.
 
     Args:
         what: Its name, for the error.

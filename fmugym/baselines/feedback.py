@@ -1,4 +1,4 @@
-"""Controllers that look at the observation."""
+"""Feedback controllers, which read the observation."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ import numpy as np
 
 from fmugym.baselines.controller import (
     Controller,
-    FloatArray,
-    Numbers,
-    Signal,
-    check_numbers,
+    NumberOrArray,
+    SignalReference,
+    checked_numbers,
     either,
     limited,
 )
@@ -24,6 +23,7 @@ from fmugym.expressions.value import Value
 from fmugym.extras import imported
 from fmugym.linearization import LinearModel
 from fmugym.linearization.trajectories import discrete
+from fmugym.pool.base import FloatArray
 
 __all__ = ["LQR", "PID", "Hysteresis"]
 
@@ -35,7 +35,7 @@ class Hysteresis(Law):
 
     Args:
         of: The name of what is measured.
-        setpoint: What it shall be: a name or a constant.
+        setpoint: Set point: a name or a constant.
         band: The controller switches where the measured value leaves the set point by this much.
         below: The action below the band; it holds until the value is above the band.
         above: The action above the band.
@@ -44,11 +44,16 @@ class Hysteresis(Law):
     signals = ("of", "setpoint")
 
     def __init__(
-        self, of: str, setpoint: Signal, band: Numbers, below: Numbers = 1.0, above: Numbers = 0.0
+        self,
+        of: str,
+        setpoint: SignalReference,
+        band: NumberOrArray,
+        below: NumberOrArray = 1.0,
+        above: NumberOrArray = 0.0,
     ) -> None:
         self.of, self.setpoint = of, setpoint
-        self.band = check_numbers("band", band, minimum=0.0)
-        self.below, self.above = check_numbers("below", below), check_numbers("above", above)
+        self.band = checked_numbers("band", band, minimum=0.0)
+        self.below, self.above = checked_numbers("below", below), checked_numbers("above", above)
         self.starts = (self.above,)
 
     def _prepare(self) -> None:
@@ -82,7 +87,7 @@ class PID(Law):
 
     Args:
         of: The name of what is measured.
-        setpoint: What it shall be: a name or a constant.
+        setpoint: Set point: a name or a constant.
         kp: The gain, in units of the action per unit of the measured value. A negative gain is for
             actions that lower the value.
         ti: The integral time in s; without one there is no integral part.
@@ -95,17 +100,17 @@ class PID(Law):
     def __init__(
         self,
         of: str,
-        setpoint: Signal,
-        kp: Numbers,
-        ti: Numbers | None = None,
-        td: Numbers = 0.0,
-        offset: Numbers = 0.0,
+        setpoint: SignalReference,
+        kp: NumberOrArray,
+        ti: NumberOrArray | None = None,
+        td: NumberOrArray = 0.0,
+        offset: NumberOrArray = 0.0,
     ) -> None:
         self.of, self.setpoint = of, setpoint
-        self.kp = check_numbers("kp", kp)
-        self.ti = None if ti is None else check_numbers("ti", ti, minimum=0.0, positive=True)
-        self.td = check_numbers("td", td, minimum=0.0)
-        self.offset = check_numbers("offset", offset)
+        self.kp = checked_numbers("kp", kp)
+        self.ti = None if ti is None else checked_numbers("ti", ti, minimum=0.0, positive=True)
+        self.td = checked_numbers("td", td, minimum=0.0)
+        self.offset = checked_numbers("offset", offset)
         self.starts = (0.0, np.nan)
 
     def _prepare(self) -> None:
@@ -143,7 +148,7 @@ class PID(Law):
         return rest if growth is None else rest + state[0] + growth
 
     def _parts(self, seen: Sequence[Any], state: Sequence[Any]) -> tuple[Any, Any, Any]:
-        """The measured value, the action without the integral, and by what the integral grows."""
+        """Measured value, action without the integral, and growth of the integral."""
         last, value = state[1], self._value(seen, self.of)
         error = self._value(seen, self.setpoint) - value
         change = either(last != last, 0.0, value - last)  # it is NaN in the first step

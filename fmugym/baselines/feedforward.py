@@ -1,4 +1,4 @@
-"""Controllers that do not look at the observation."""
+"""Feedforward controllers, which do not read the observation."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, FloatArray, either
+from fmugym.baselines.controller import Controller, either
 from fmugym.baselines.law import Decided, Law
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Constant", "Random", "Schedule"]
 
@@ -49,7 +50,7 @@ class Random(Controller):
     """Samples the action space.
 
     Args:
-        seed: Of the samples; the same seed gives the same actions after each ``bind``.
+        seed: Seed of the samples; the same seed gives the same actions after each ``bind``.
     """
 
     is_physical = False
@@ -74,7 +75,7 @@ class Schedule(Law):
         start: The time of day at which an episode begins.
 
     Attributes:
-        clock: What tells the time in seconds since any midnight; None to count it from ``start``.
+        clock: Name of the time in seconds since any midnight; None to count it from ``start``.
     """
 
     signals = ("clock",)

@@ -1,4 +1,4 @@
-"""Controllers whose decision follows from formulas, which are played and exported alike."""
+"""Control laws: controllers given by formulas, which are played and exported alike."""
 
 from __future__ import annotations
 
@@ -9,24 +9,25 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.controller import Controller, FloatArray, Numbers
+from fmugym.baselines.controller import Controller, NumberOrArray
 from fmugym.expressions.value import Value
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Decided", "Law"]
 
 Decided = tuple[Sequence[Any], tuple[Any, ...]]
-"""The elements of an action before they are limited, and what a controller remembers then."""
+"""Elements of an action before the limits, and the new memory of a controller."""
 
 
 class Law(Controller):
-    """A controller whose next action follows from what it sees and a few numbers.
+    """Controller given by formulas of the observation and a few remembered numbers.
 
     Attributes:
         starts: The numbers that it remembers, at the beginning of an episode.
         signals: The attributes that are signals.
     """
 
-    starts: tuple[Numbers, ...] = ()
+    starts: tuple[NumberOrArray, ...] = ()
     _before: tuple[Sequence[Any], Sequence[Any]]
     signals: ClassVar[tuple[str, ...]] = ()
 
@@ -38,9 +39,9 @@ class Law(Controller):
 
         Args:
             seen: The elements of the observation.
-            state: What the controller remembers, in the order of ``starts``.
+            state: Memory of the controller, in the order of ``starts``.
             holds: Whether an integral must not grow, because nothing would follow it.
-            added: What is added to each element of the action; None for nothing. See
+            added: Correction of each element of the action; None for nothing. See
                 ``Controller.add``.
         """
 
@@ -54,7 +55,7 @@ class Law(Controller):
         return self.law(seen, state)[0][0]
 
     def measured(self) -> list[str]:
-        """What it measures, and its set point: names and other expressions."""
+        """Measured value and set point: names and other expressions."""
         given = (getattr(self, name) for name in self.signals)
         return [one for one in given if isinstance(one, str)]
 

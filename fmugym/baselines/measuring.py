@@ -1,4 +1,4 @@
-"""Signals of controllers: expressions of what they observe."""
+"""Signals of controllers: expressions of observed values."""
 
 from __future__ import annotations
 

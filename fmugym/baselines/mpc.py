@@ -1,4 +1,4 @@
-"""Model predictive control: the next action of the best plan that copies of the FMU have found."""
+"""Model predictive control: the first action of the best plan on copies of the FMU."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.controller import Controller, FloatArray, attribute_of
-from fmugym.baselines.observer import COPIES, CORRECTION, Observer, spread
+from fmugym.baselines.controller import Controller, attribute_of
+from fmugym.baselines.observer import COPIES, CORRECTION, Observer, parameters_of_copies
 from fmugym.checks import (
     LARGEST_COUNT,
     check_count,
@@ -29,6 +29,7 @@ from fmugym.checks import (
 )
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 from fmugym.task.future import Future, future_of
 from fmugym.task.saving import scope_of
 from fmugym.task.snapshot import Snapshot
@@ -44,10 +45,10 @@ _DECADES: Final = 1.5
 """Over so many powers of ten the heights of pulses are spread."""
 
 _PENALTY: Final = 1e9
-"""How much more a unit of a cost beyond its limit counts than one of the reward."""
+"""Weight of a unit of a cost beyond its limit, relative to a unit of the reward."""
 
 _FAILURE: Final = 1e100
-"""How much each step counts that a plan lacks because a copy has failed."""
+"""Penalty of each step that a plan lacks because a copy has failed."""
 
 _SURROGATE: Final = "surrogate"
 """The name of a model that is fitted to the FMU."""
@@ -91,7 +92,7 @@ class MPC(Controller):
             needs all states, and a task without data.
         perfect: Whether the true state and the true future are known. Nobody can beat this but by
             a better search; it shows how much there is to gain.
-        seed: Of the candidates. The same arguments give the same actions.
+        seed: Seed of the candidates. The same arguments give the same actions.
         model: A function that makes the environment to plan with, which has the observations and
             actions of the controlled one. By default that is copied; the environments of
             ``fmugym.plant`` know one. Or ``"surrogate"``: plans are tried on a surrogate of the
@@ -203,7 +204,7 @@ class MPC(Controller):
         return self._surrogate[1]
 
     def _model_of(self) -> Callable[[], Any]:
-        """What makes copies."""
+        """Maker of the copies of the model."""
         if callable(self.model):
             return self.model
         env: FMUEnv = attribute_of(self._env, "unwrapped")
@@ -298,7 +299,7 @@ class MPC(Controller):
     def _begun(self, env: FMUEnv) -> _Episode:
         """Begin an episode of the copies; the first one has the nominal parameters."""
         copied, episode = self._copies, _Episode()
-        values = spread(self._prototype, self.seed)
+        values = parameters_of_copies(self._prototype, self.seed)
         if self._prototype.config.draws_start_time:
             values["start_time"] = np.full(COPIES, env.time - env.step_count * self.time_step)
         for place in range(COPIES if values else 1):
@@ -325,12 +326,12 @@ class MPC(Controller):
         return episode
 
     def _measured(self, env: FMUEnv) -> npt.NDArray[np.bool_]:
-        """Which elements of the observation were measured now, and do not hold or lie ahead."""
+        """Mask of the observed elements that were measured now, and do not hold or lie ahead."""
         is_held = np.isin([*self._prototype.out], [*env.held_outputs()])
         return np.asarray(self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1))
 
     def _follow(self, episode: _Episode, action: Any, row: FloatArray, now: float) -> None:
-        """Let the copies do the step that the environment has done, with what was observed."""
+        """Step the copies as the environment was stepped, and correct them by the observation."""
         if episode.have_ended:
             return
         copied = self._copies
@@ -353,7 +354,7 @@ class MPC(Controller):
         episode.observer.follow(off, sources)
 
     def _find_slopes(self, snapshot: Snapshot) -> FloatArray:
-        """How present values of the observation follow the outputs, shape (k, o)."""
+        """Slopes of present observed values by the outputs, shape (k, o)."""
         copied = self._copies
         action = self._actions(np.full((1, *self._plan_shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
@@ -368,7 +369,7 @@ class MPC(Controller):
     def _start_of(
         self, index: int, episode: _Episode, row: FloatArray, now: float
     ) -> tuple[Snapshot, dict[str, Any], dict[str, Any]]:
-        """Where candidates begin, the data that they assume, and more arguments of rollouts."""
+        """States from which candidates begin, the data that they assume, and arguments."""
         if self.perfect:
             return self._env.save_state(*([[index]] if self._is_vector else [])), {}, {}
         if self.states:
@@ -390,7 +391,9 @@ class MPC(Controller):
         values = expected + part * (row[self._places] - expected)
         values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
-        nominal = {n: float(v[0]) for n, v in spread(self._prototype, self.seed).items()}
+        nominal = {
+            n: float(v[0]) for n, v in parameters_of_copies(self._prototype, self.seed).items()
+        }
         copied = self._copies
         seed = self.seed + episode.steps
         copied.reset(seed=seed, options={"model_parameters": nominal | starts})
@@ -458,7 +461,7 @@ class MPC(Controller):
         return _Plan(float(values[place]), plans[place], costs)
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
-        """What costs may add up to until the horizon, from what the episode has left of them."""
+        """Limits of costs until the horizon, from the rest that the episode has left."""
         steps, limit = self._plan_shape[0], self._prototype.step_limit
         left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
@@ -469,7 +472,7 @@ class MPC(Controller):
     def _first_plans(
         self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
     ) -> FloatArray:
-        """The plan of the step before, and those of the simple controllers."""
+        """Plan of the step before, and plans of the simple controllers."""
         shifted = np.append(episode.plan[1:], episode.plan[-1:], axis=0)
         if not episode.warm:
             return shifted[np.newaxis]
@@ -497,7 +500,7 @@ class _Plan(NamedTuple):
     Attributes:
         value: The return.
         numbers: The actions until the horizon, from 0 to 1, shape (steps, m).
-        costs: Those of the first step by name.
+        costs: Costs of the first step by name.
     """
 
     value: float
@@ -506,11 +509,11 @@ class _Plan(NamedTuple):
 
 
 class _Episode:
-    """What is known of the episode of one environment.
+    """Knowledge about the episode of one environment.
 
     Attributes:
-        snapshot: Where the copies are.
-        seen: What they observe, shape (n, k).
+        snapshot: State of the copies.
+        seen: Observations, shape (n, k).
         observer: Knows which copy fits best, and what is added to the outputs of each.
         have_ended: Whether their episodes have ended; the last snapshot stays.
         plan: The latest plan, from 0 to 1, shape (steps, m).
@@ -540,13 +543,13 @@ class _Episode:
 
 
 class _Foresight:
-    """Tells from observations what data will be.
+    """Forecasts of data, made of observations.
 
     Args:
-        names: Those of the observation's elements.
+        names: Names of the observation's elements.
         future: Has the data.
         time_step: The length of a step in s.
-        steps: Those until the horizon.
+        steps: Steps until the horizon.
 
     Attributes:
         is_present: Which elements are present values, shape (k,).
@@ -571,7 +574,7 @@ class _Foresight:
                 self._known[of].sort()
 
     def note(self, told: dict[str, dict[int, float]], row: FloatArray, step: int) -> None:
-        """Keep what is observed and forecast.
+        """Keep observed and forecast data.
 
         Args:
             told: The latest value of each step by name.

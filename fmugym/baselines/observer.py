@@ -1,4 +1,4 @@
-"""How copies of an FMU follow a plant: which one fits best, and how far its outputs are off."""
+"""Observer of a plant: copies of an FMU that follow it, weighted by their errors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.controller import FloatArray
-from fmugym.distributions import Column, is_distribution
+from fmugym.distributions import DrawnColumn, is_distribution
 from fmugym.env import FMUEnv
+from fmugym.pool.base import FloatArray
 
-__all__ = ["COPIES", "CORRECTION", "Observer", "spread"]
+__all__ = ["COPIES", "CORRECTION", "Observer", "parameters_of_copies"]
 
 COPIES: Final = 9
 """So many different copies run beside each environment."""
@@ -23,11 +23,11 @@ _LASTING: Final = 0.98
 """The part of the past errors of a copy that counts after a step."""
 
 _SAMPLES: Final = 1001
-"""The copies have quantiles of so many samples of what is drawn."""
+"""Number of samples of which the copies take quantiles."""
 
 
 class Observer:
-    """What is known of copies that run beside a plant.
+    """Estimates of copies that run beside a plant.
 
     Args:
         count: The number n of copies.
@@ -37,7 +37,7 @@ class Observer:
 
     Attributes:
         errors: The sums of squared differences from what was measured, shape (n, k).
-        offsets: What is added to the outputs of each copy, shape (n, o).
+        offsets: Corrections of the outputs of each copy, shape (n, o).
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Observer:
         self._correction = correction
 
     def follow(self, off: FloatArray, sources: Any = slice(None)) -> None:
-        """Count what was measured beyond the copies.
+        """Add measured values to the estimates of the copies.
 
         Args:
             off: The differences, 0 where nothing was measured, shape (n, k).
@@ -60,20 +60,20 @@ class Observer:
         """Let the offsets follow.
 
         Args:
-            wanted: What the outputs of each copy lack now, shape (n, o).
+            wanted: Present errors of the outputs of each copy, shape (n, o).
             which: The outputs that are known.
         """
         self.offsets = self.offsets + which * self._correction * (wanted - self.offsets)
 
     @property
     def best(self) -> int:
-        """The copy that fits best; each measured value counts by what copies differ in it."""
+        """Copy that fits best; measured values are weighted by the spread of the copies."""
         totals = self.errors.sum(axis=0)
         parts = self.errors / np.where(totals > 0.0, totals, 1.0)
         return int(parts.sum(axis=1).argmin())
 
 
-def spread(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
+def parameters_of_copies(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
     """Values of the parameters that are drawn, by name, one for each copy; medians come first.
 
     Columns of a table have whole rows, from the nearest to the medians to one far away.
@@ -82,7 +82,7 @@ def spread(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
     others = np.delete(np.arange(COPIES), COPIES // 2)
     tables: dict[str, dict[str, FloatArray]] = {}
     for name, value in env.config.model_parameters.items():
-        if type(value) is Column:
+        if type(value) is DrawnColumn:
             tables.setdefault(value.table, {})[name] = np.array(value.values, np.float64)
         elif is_distribution(value):
             drawn = [value.sample(rng) for _ in range(_SAMPLES)]

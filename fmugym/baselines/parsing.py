@@ -14,7 +14,7 @@ from typing import Any, Final, TypeGuard
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
 from fmugym.baselines.mpc import MPC
@@ -30,9 +30,10 @@ from fmugym.baselines.table_texts import (
 from fmugym.checks import check_text
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.pool.base import FloatArray
 
 __all__ = [
-    "Search",
+    "TunableController",
     "controller_of",
     "has_range",
     "plans_ahead",
@@ -103,7 +104,7 @@ def _parts(text: str) -> tuple[str, dict[str, Any]]:
     return kind, dict(map(_argument, words))
 
 
-class Search(ABC):
+class TunableController(ABC):
     """A controller some of whose numbers are to be found.
 
     Attributes:
@@ -140,13 +141,13 @@ class Search(ABC):
 
 
 @dataclass(frozen=True)
-class TextSearch(Search):
+class TextSearch(TunableController):
     """The search for numbers of a controller that a text names.
 
     Attributes:
         kind: The name of its class in texts.
         fixed: The arguments that are given.
-        ranges: See ``Search``.
+        ranges: See ``TunableController``.
         negative: The names of those whose values are minus those in ``ranges``.
     """
 
@@ -156,18 +157,18 @@ class TextSearch(Search):
     negative: frozenset[str] = frozenset()
 
     def make(self, **numbers: Any) -> Controller:
-        """See ``Search.make``."""
+        """See ``TunableController.make``."""
         return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
 
     def text(self, numbers: Mapping[str, Any]) -> str:
-        """See ``Search.text``."""
+        """See ``TunableController.text``."""
         found = self.numbers(numbers)
         given = {name: found.get(name, value) for name, value in self._in_order().items()}
         words = [f"{name}={str(value).removesuffix('.0')}" for name, value in given.items()]
         return shlex.join([self.kind, *words])
 
     def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """See ``Search.numbers``."""
+        """See ``TunableController.numbers``."""
         return {
             name: _rounded(-value if name in self.negative else value)
             for name, value in found.items()
@@ -180,20 +181,20 @@ class TextSearch(Search):
 
 
 @dataclass(frozen=True)
-class TableSearch(Search):
+class TableSearch(TunableController):
     """The search for all numbers of a table, whose names are such as ``"u.kp"``.
 
     Attributes:
-        entries: Those of the table.
+        entries: Entries of the table.
         searches: By entry, those of the controllers that have ranges.
     """
 
     entries: Mapping[str, Any]
-    searches: Mapping[str, Search]
+    searches: Mapping[str, TunableController]
 
     @property
     def ranges(self) -> Mapping[str, Uniform | LogUniform]:  # type: ignore[override]  # a field there
-        """See ``Search``."""
+        """See ``TunableController``."""
         return {
             f"{name}.{key}": one
             for name, search in self.searches.items()
@@ -201,12 +202,12 @@ class TableSearch(Search):
         }
 
     def make(self, **numbers: Any) -> Controller:
-        """See ``Search.make``."""
+        """See ``TunableController.make``."""
         own = self._divided(numbers)
         return _table(self.entries, {n: one.make(**own[n]) for n, one in self.searches.items()})
 
     def text(self, numbers: Mapping[str, Any]) -> str:
-        """See ``Search.text``."""
+        """See ``TunableController.text``."""
         own = self._divided(numbers)
         texts = {name: one.text(own[name]) for name, one in self.searches.items()}
         return text_of(
@@ -217,7 +218,7 @@ class TableSearch(Search):
         )
 
     def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
-        """See ``Search.numbers``."""
+        """See ``TunableController.numbers``."""
         own = self._divided(found)
         return {
             f"{name}.{key}": value
@@ -234,7 +235,7 @@ class TableSearch(Search):
         return found
 
 
-def search_of(text: str | Mapping[str, Any]) -> Search:
+def search_of(text: str | Mapping[str, Any]) -> TunableController:
     """Read a controller of which some numbers are ranges.
 
     Args:

@@ -1,4 +1,4 @@
-"""A controller of several actions: a table of controllers of one number each, and of cascades."""
+"""Table of controllers for several actions, with cascades over signals."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class ControllerTable(Law):
         return [name for name, own in pairs if not isinstance(self.entries[own], Constant)]
 
     def told(self) -> list[tuple[Any, ...]]:
-        """What tells the table from others, before it is bound."""
+        """Identity of the table, before it is bound."""
         limits = {n: (e.low, e.high) for n, e in self.entries.items() if isinstance(e, Signal)}
         return [
             (name, type(self._law(name)), vars(self._law(name)), limits.get(name))
@@ -95,7 +95,7 @@ class ControllerTable(Law):
         return entry.controller if isinstance(entry, Signal) else entry
 
     def measured(self) -> list[str]:
-        """See ``Law.measured``: what is no signal of the table, nor has one in it."""
+        """Measured values of the table without its own signals; see ``Law.measured``."""
         found: dict[str, None] = {}
         for text in (text for law in self.laws() for text in law.measured()):
             names = _names_in(text)
@@ -103,7 +103,7 @@ class ControllerTable(Law):
             found |= dict.fromkeys([one for one in names if one not in read] if read else [text])
         return list(found)
 
-    # How entries depend on each other.
+    # Dependencies of entries.
 
     def _signal(self, name: str) -> str | None:
         """The signal of a name; None for the name of something else."""
@@ -201,7 +201,7 @@ class ControllerTable(Law):
         return [decided[name] for name in self._columns], remembered
 
     def _divided(self, state: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
-        """What each entry remembers."""
+        """Memory of each entry."""
         first = 0
         for name in self._order:
             last = first + len(self._law(name).starts)
@@ -227,7 +227,7 @@ class ControllerTable(Law):
         return self._beyond(name, grown, seen, states) > self._beyond(name, kept, seen, states)
 
     def _beyond(self, name: str, value: Any, seen: Sequence[Any], states: Mapping[str, Any]) -> Any:
-        """How far a value goes beyond what is used of it, by the entry's limits or its readers."""
+        """Excess of a value over the range that the entry's limits or its readers use."""
         used = self._limited(name, value)
         beyond = np.abs(value - used)
         if name not in self._places:
@@ -284,7 +284,7 @@ def _checked(name: str, entry: Any) -> Law | Signal:
 
 
 def _names_in(text: str) -> list[str]:
-    """The names in a signal: those of an expression, or the whole text."""
+    """Names in a signal: names of an expression, or the whole text."""
     with suppress(ConfigError):
         return sorted(Expression.parse(text).names)
     return [text]

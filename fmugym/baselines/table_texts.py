@@ -72,7 +72,7 @@ def _require_signal(name: str, entry: Mapping[str, Any]) -> None:
 
 
 def controller_in(entry: Any) -> Any:
-    """The controller of an entry, be it that of an action or of a signal."""
+    """Controller of an entry for an action or a signal."""
     return entry["controller"] if isinstance(entry, Mapping) else entry
 
 
@@ -108,7 +108,7 @@ def named_controllers(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def parts_of(given: Mapping[str, Any]) -> set[Any]:
-    """What stands in tables, among others the names of other controllers.
+    """Values that stand in tables, names of other controllers among them.
 
     Args:
         given: As for ``named_controllers``.
@@ -122,7 +122,7 @@ def resolved(given: Any, known: Mapping[str, Any]) -> Any:
 
     Args:
         given: A text, a number or a table.
-        known: What names stand for.
+        known: Controllers by name.
 
     Raises:
         ConfigError: If a name in a table is no controller of one number.
@@ -144,7 +144,7 @@ def acting_text(given: Any) -> str:
 
 
 def _named(name: str, given: Any, known: Mapping[str, Any]) -> Any:
-    """What an entry of a table stands for."""
+    """Resolve an entry of a table that names another controller."""
     own = Spellings("controller of the task", known).find(given)
     if own is None and known and isinstance(given, str) and given.isidentifier():
         raise ConfigError(f"{name}: {unknown_name('controller of the task', given, known)}")

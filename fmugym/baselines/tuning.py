@@ -9,15 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.candidate_evaluation import MOST_STEPS, CandidateEvaluator
+from fmugym.baselines.candidate_search import CandidateSearch
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.controller import Controller, FloatArray
-from fmugym.baselines.entrants import Entrant
+from fmugym.baselines.controller import Controller
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 
-__all__ = ["Tuning", "entrant_of", "numbers_at", "tune"]
+__all__ = ["Tuning", "candidate_search_of", "numbers_at", "tune"]
 
 _LEAST_CANDIDATES: Final = 8
 _SIGMA: Final = 0.2
@@ -26,7 +27,7 @@ _SIGMA: Final = 0.2
 
 @dataclass(frozen=True)
 class Tuning:
-    """What a search has found.
+    """Result of a search for the numbers of a controller.
 
     Attributes:
         controller: The best controller, to be bound.
@@ -41,18 +42,18 @@ class Tuning:
     returns: tuple[float, ...]
 
 
-def entrant_of(
+def candidate_search_of(
     make: Any,
     ranges: Mapping[str, Uniform | LogUniform],
     sizes: tuple[int, int],
     episodes: int,
     rng: np.random.Generator,
-) -> Entrant:
+) -> CandidateSearch:
     """A search for numbers, which begins everywhere and goes on from the best candidate.
 
     Args:
-        make: As for an ``Entrant``.
-        ranges: What ``numbers_at`` takes.
+        make: As for a ``CandidateSearch``.
+        ranges: Ranges of the numbers, as ``numbers_at`` takes them.
         sizes: The candidates of the first round, and of the others.
         episodes: How many each candidate plays.
         rng: Draws them.
@@ -60,7 +61,7 @@ def entrant_of(
     first, others = sizes
     places = rng.uniform(size=(first, len(ranges)))
     cma = CMA(places[0], _SIGMA, others, rng, growth=1.0)
-    return Entrant(cma, make, episodes, first=places)
+    return CandidateSearch(cma, make, episodes, first=places)
 
 
 def numbers_at(
@@ -115,7 +116,7 @@ def tune(
         episodes: How many episodes each of them plays. Those of all rounds are the same.
         rounds: The number of rounds.
         most_steps: Steps after which an episode is stopped.
-        seed: Of the candidates and of the episodes.
+        seed: Seed of the candidates and of the episodes.
         watch: Gets the best candidate until now after each round.
         advance: Is told of each step, as a part of a round.
 
@@ -133,7 +134,7 @@ def tune(
     if not ranges:
         raise ConfigError("search needs the name of at least one number")
     seed = check_seed(seed) or 0
-    entrant = entrant_of(
+    candidate_search = candidate_search_of(
         lambda rows: make_controller(**numbers_at(ranges, rows)),
         ranges,
         (candidates, candidates),
@@ -141,11 +142,14 @@ def tune(
         np.random.default_rng(seed),
     )
     returns: list[float] = []
-    with closing(Arena(make_env, most_steps=most_steps, advance=advance)) as arena:
+    with closing(CandidateEvaluator(make_env, most_steps=most_steps, advance=advance)) as evaluator:
         for _ in range(rounds):
-            _, reached = entrant.play(arena, range(seed, seed + episodes))
+            _, reached = candidate_search.play(evaluator, range(seed, seed + episodes))
             returns.append(reached)
-            best = {name: float(one) for name, one in numbers_at(ranges, entrant.leader).items()}
+            best = {
+                name: float(one)
+                for name, one in numbers_at(ranges, candidate_search.leader).items()
+            }
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
             if watch is not None:
                 watch(found)

@@ -16,7 +16,7 @@ __all__ = ["beginning_of", "bounds_of", "samplings_of", "time_step_of", "times_o
 
 
 def time_step_of(root: Entry, description: ModelDescription) -> float:
-    """The length of a step in seconds: that of the task, or the default of the FMU.
+    """Length of a step in seconds, as the task gives it, or the default of the FMU.
 
     Raises:
         ConfigError: If neither gives a positive one.
@@ -49,7 +49,7 @@ def times_of(naming: Naming) -> dict[str, Any]:
 
 
 def _start_time(declared: Declarations, length: float) -> Any:
-    """The start time of the FMU, or what it is drawn from; a warm-up and the episode follow."""
+    """Start time of the FMU, or its distribution; a warm-up and the episode follow."""
     root = declared.root
     start, scenarios = root.child("start_time"), read_scenarios(root)
     span = declared.warm_up.period + length
@@ -81,14 +81,14 @@ def beginning_of(naming: Naming) -> dict[str, Any]:
 
 
 def samplings_of(naming: Naming) -> dict[str, str]:
-    """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
+    """Samplings of outputs that differ from ``"last"``, by the names in the FMU."""
     names = (*naming.outputs, *naming.monitors)
     found = [naming.declared.variables[name].fmu_variable for name in names]
     return {one.name: one.sampling for one in found if one.sampling != "last"}
 
 
 def bounds_of(naming: Naming) -> dict[str, tuple[float, float]]:
-    """The limits that the task gives of what it writes, observes and lets episodes start with."""
+    """Limits that the task gives for its inputs, observations and start values."""
     declared = naming.declared
     names = (*declared.written, *naming.outputs, *declared.parameters)
     found = [declared.variables[name].fmu_variable for name in names]

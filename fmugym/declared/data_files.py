@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import require_regular
-from fmugym.declared.data_tables import Column, Table
+from fmugym.declared.data_tables import DataColumn, DataTable
 from fmugym.declared.weather import read_modelica, read_weather
-from fmugym.errors import ConfigError, reading, reason, shown
+from fmugym.errors import ConfigError, reading_file, reason, shown
 from fmugym.extras import imported
 
 __all__ = ["read_tables"]
@@ -24,7 +24,7 @@ _SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas"}
 _QUOTED: Final = re.compile('"[^"]*"')
 
 
-def read_tables(path: Path) -> Mapping[str, Table]:
+def read_tables(path: Path) -> Mapping[str, DataTable]:
     """Read the tables of a file by name. A file that has not changed is read once.
 
     Raises:
@@ -38,7 +38,7 @@ def read_tables(path: Path) -> Mapping[str, Table]:
 
 
 @lru_cache(maxsize=16)
-def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Table]:
+def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, DataTable]:
     """Read a Parquet file, whose cells have types."""
     pyarrow, parquet = imported("pyarrow", "parquet"), imported("pyarrow.parquet", "parquet")
     try:
@@ -51,24 +51,24 @@ def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Table]:
         raise ConfigError(f"{path.name} is no Parquet file: {reason(error)}") from None
     if not table.num_rows:
         raise ConfigError(f"{path.name} has no rows")
-    return {path.stem: Table(columns)}
+    return {path.stem: DataTable(columns)}
 
 
-def _column_of_arrow(file: str, name: str, column: Any) -> Column:
+def _column_of_arrow(file: str, name: str, column: Any) -> DataColumn:
     pyarrow: Any = imported("pyarrow", "parquet")
     types, kind, rows = pyarrow.types, column.type, range(2, len(column) + 2)
     if types.is_timestamp(kind) or types.is_date(kind):
-        return Column(file, name, column.to_numpy(), rows, getattr(kind, "tz", None))
+        return DataColumn(file, name, column.to_numpy(), rows, getattr(kind, "tz", None))
     tests = types.is_integer, types.is_floating, types.is_decimal, types.is_boolean
     if any(test(kind) for test in tests):
         numbers = column.cast(pyarrow.float64(), safe=False).to_numpy()
-        return Column(file, name, numbers, rows)
-    return Column(file, name, column.to_pylist(), rows)
+        return DataColumn(file, name, numbers, rows)
+    return DataColumn(file, name, column.to_pylist(), rows)
 
 
 @lru_cache(maxsize=16)
-def _read_text(path: Path, changed: int, size: int) -> Mapping[str, Table]:
-    """Read a file. Its first line tells what it is."""
+def _read_text(path: Path, changed: int, size: int) -> Mapping[str, DataTable]:
+    """Read a file of text, whose first line tells its format."""
     content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     if content.startswith((b"#1", b"LOCATION,")):  # names of places have any encoding
         lines = [line.decode("latin-1") for line in content.splitlines()]
@@ -78,7 +78,7 @@ def _read_text(path: Path, changed: int, size: int) -> Mapping[str, Table]:
     return {path.stem: _read_csv(path, content)}
 
 
-def _read_csv(path: Path, content: bytes) -> Table:
+def _read_csv(path: Path, content: bytes) -> DataTable:
     """Read a CSV file.
 
     Raises:
@@ -92,7 +92,7 @@ def _read_csv(path: Path, content: bytes) -> Table:
     heading = _QUOTED.sub("", file.readline())
     separator = next((one for one in _SEPARATORS if one in heading), ",")
     file.seek(0)
-    with reading(f"{path.name} is no table"):
+    with reading_file(f"{path.name} is no table"):
         numbers, lines = _lines([*csv.reader(file, delimiter=separator)])
     header, rows = (lines or [[]])[0], lines[1:]
     if wrong := {*map(len, rows)} - {len(header)}:
@@ -105,10 +105,10 @@ def _read_csv(path: Path, content: bytes) -> Table:
         raise ConfigError(f"{path.name} has no rows below its header")
     has_commas = separator != ","
     columns = [
-        Column(path.name, name.strip(), cells, numbers[1:], may_have_commas=has_commas)
+        DataColumn(path.name, name.strip(), cells, numbers[1:], may_have_commas=has_commas)
         for name, cells in zip(header, zip(*rows, strict=True), strict=True)
     ]
-    return Table(columns, _SEPARATORS[separator])
+    return DataTable(columns, _SEPARATORS[separator])
 
 
 def _lines(lines: list[list[str]]) -> tuple[Sequence[int], list[list[str]]]:

@@ -1,4 +1,4 @@
-"""Rows of data: times on the clock of a task and values, with what is missing."""
+"""Rows of data: times on the clock of a task, and values, some of which may be missing."""
 
 from __future__ import annotations
 
@@ -14,34 +14,35 @@ import numpy.typing as npt
 
 from fmugym.checks import Spellings, check_path
 from fmugym.declared.data_files import read_tables
-from fmugym.declared.data_tables import Column, Table
-from fmugym.declared.dates import CURE, DAY, HOUR, REGULAR, Dates, FloatArray
+from fmugym.declared.data_tables import DataColumn, DataTable
+from fmugym.declared.dates import DAY, HOUR, LOCAL_TIME_ADVICE, REGULAR, Dates
 from fmugym.declared.entries import Entry
 from fmugym.errors import ConfigError, missing_file, shown
+from fmugym.pool.base import FloatArray
 
-__all__ = ["Rows", "offsets_of", "read_rows", "usual_distance"]
+__all__ = ["DataRows", "read_rows", "usual_distance", "utc_offsets_of"]
 
 _SAME: Final = 1e-6
 """Distances that differ by less, as a part of them, are equal."""
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class DataRows:
     """Rows of data as they stand in a file or a list.
 
     Attributes:
-        entry: Where they are declared.
+        entry: Entry of the task.
         table: The table that they are from.
         value: The column of values; NaN is an empty cell.
-        time: That of times; None if there is only a distance between rows.
+        time: Column of times; None if there is only a distance between rows.
         dates: The times on the standard time; None if they are seconds.
         times: Seconds since the beginning of the year, shape (n,); NaN on 29 February.
     """
 
     entry: Entry
-    table: Table
-    value: Column
-    time: Column | None
+    table: DataTable
+    value: DataColumn
+    time: DataColumn | None
     dates: Dates | None
     times: FloatArray
 
@@ -52,12 +53,12 @@ class Rows:
 
     @property
     def has_calendar(self) -> bool:
-        """Whether its times are dates, or those of weather, rather than any seconds."""
+        """Whether the times are dates or hours of weather, rather than any seconds."""
         return self.dates is not None or (self.time is not None and self.time.of_year)
 
     @cached_property
     def is_known(self) -> npt.NDArray[np.bool_]:
-        """Which rows have a time and a value, shape (n,)."""
+        """Mask of the rows with a time and a value, shape (n,)."""
         return ~np.isnan(self.times) & ~np.isnan(self.value.numbers)
 
     @property
@@ -102,7 +103,7 @@ class Rows:
             return
         place = int(np.flatnonzero(~(steps > 0))[0])
         is_local = self.dates is not None and self.dates.offsets is None
-        hint = f". {CURE}" if is_local and steps[place] >= -HOUR else ""
+        hint = f". {LOCAL_TIME_ADVICE}" if is_local and steps[place] >= -HOUR else ""
         raise ConfigError(
             f"the times must rise, but in column {shown(self.time.name)} "
             f"{self.told(kept[place + 1])} is not above {self.told(kept[place])}{hint}"
@@ -176,11 +177,11 @@ def usual_distance(times: FloatArray) -> float | None:
     return usual if is_regular and usual > 0 else None
 
 
-def read_rows(entry: Entry, standard: int | None = None) -> Rows:
+def read_rows(entry: Entry, standard: int | None = None) -> DataRows:
     """Read the rows of a file or of a list.
 
     Args:
-        entry: Where they are declared.
+        entry: Entry of the task.
         standard: The offset of the standard time in seconds east of UTC; None for the smallest
             offset of the rows.
 
@@ -194,16 +195,16 @@ def read_rows(entry: Entry, standard: int | None = None) -> Rows:
         _require_finite(value)
     if time is None:
         times = np.arange(len(value.rows), dtype=np.float64) * entry.value["step"]
-        return Rows(entry, table, value, None, None, times)
+        return DataRows(entry, table, value, None, None, times)
     with _placing(entry, "time", "times"):
         dates, times = _on_standard_time(entry, table, time, standard)
-        rows = Rows(entry, table, value, time, dates, times)
+        rows = DataRows(entry, table, value, time, dates, times)
         rows.require_rising()
     return rows
 
 
 def _on_standard_time(
-    entry: Entry, table: Table, time: Column, standard: int | None
+    entry: Entry, table: DataTable, time: DataColumn, standard: int | None
 ) -> tuple[Dates | None, FloatArray]:
     """The dates of rows, None for seconds, and the seconds of the year."""
     dates = _dates(entry, time)
@@ -222,8 +223,8 @@ def _placing(entry: Entry, of_file: str, of_list: str) -> Iterator[None]:
         yield
 
 
-def _dates(entry: Entry, time: Column) -> Dates | None:
-    """The times as dates, those without offset of the zone that is declared; None for seconds."""
+def _dates(entry: Entry, time: DataColumn) -> Dates | None:
+    """Read times as dates; None for seconds. Dates without an offset are in the declared zone."""
     zone = entry.value.get("timezone")
     if not time.is_numeric:
         return time.dates_in(zone)
@@ -232,7 +233,7 @@ def _dates(entry: Entry, time: Column) -> Dates | None:
     return None
 
 
-def _seconds(time: Column) -> FloatArray:
+def _seconds(time: DataColumn) -> FloatArray:
     seconds = time.numbers
     wrong = np.flatnonzero(~np.isfinite(seconds))
     if len(wrong):
@@ -241,18 +242,18 @@ def _seconds(time: Column) -> FloatArray:
     return seconds
 
 
-def _require_finite(value: Column) -> None:
+def _require_finite(value: DataColumn) -> None:
     wrong = np.flatnonzero(np.isinf(value.numbers))
     if len(wrong):
         cell = value.cells[wrong[0]]
         raise ConfigError(f"{value.told(int(wrong[0]))}: expected a number, got {shown(cell)}")
 
 
-def offsets_of(entry: Entry) -> tuple[str, int | None, tuple[int, ...]]:
+def utc_offsets_of(entry: Entry) -> tuple[str, int | None, tuple[int, ...]]:
     """The offsets from UTC that data tell, in seconds.
 
     Args:
-        entry: Where the data are declared.
+        entry: Entry of the task.
 
     Returns:
         The name of the file, the offset in its header or None, and those of its dates.
@@ -270,7 +271,7 @@ def offsets_of(entry: Entry) -> tuple[str, int | None, tuple[int, ...]]:
 # Columns.
 
 
-def _table(entry: Entry) -> Table:
+def _table(entry: Entry) -> DataTable:
     """The table that is meant; a file of rows has one only."""
     if "values" in entry.value:
         return _table_of_lists(entry)
@@ -283,7 +284,7 @@ def _table(entry: Entry) -> Table:
         return tables[Spellings("table", tables).require(name.value)]
 
 
-def _read_file(file: Entry) -> Mapping[str, Table]:
+def _read_file(file: Entry) -> Mapping[str, DataTable]:
     path = check_path("file", file.value)
     try:
         with file.placing():
@@ -294,7 +295,7 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
 
-def _table_of_lists(entry: Entry) -> Table:
+def _table_of_lists(entry: Entry) -> DataTable:
     values, times, step = (entry.value.get(key) for key in ("values", "times", "step"))
     if not len(values):
         raise entry.error("expected at least one value")
@@ -305,10 +306,10 @@ def _table_of_lists(entry: Entry) -> Table:
         raise entry.child("times").error(f"there are {len(times)} times, but {len(values)} values")
     lists = {"values": values} if times is None else {"values": values, "times": times}
     rows = range(1, len(values) + 1)
-    return Table([Column("", name, cells, rows) for name, cells in lists.items()])
+    return DataTable([DataColumn("", name, cells, rows) for name, cells in lists.items()])
 
 
-def _value_column(entry: Entry, table: Table) -> Column:
+def _value_column(entry: Entry, table: DataTable) -> DataColumn:
     if "values" in entry.value:
         return table.find("values")
     column = entry.required("column")
@@ -316,7 +317,7 @@ def _value_column(entry: Entry, table: Table) -> Column:
         return table.find(column.value)
 
 
-def _time_column(entry: Entry, table: Table) -> Column | None:
+def _time_column(entry: Entry, table: DataTable) -> DataColumn | None:
     """The column of times; None if there is a step between rows."""
     if entry.value.get("step") is not None:
         return None

@@ -13,23 +13,24 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.checks import Spellings, check_integer, normal_form
-from fmugym.declared.dates import Dates, FloatArray, IntArray, shown_date, zone_of
+from fmugym.declared.dates import Dates, IntArray, shown_date, zone_of
 from fmugym.errors import ConfigError, first_of, shown, unknown_name
+from fmugym.pool.base import FloatArray
 
-__all__ = ["Column", "Table"]
+__all__ = ["DataColumn", "DataTable"]
 
 Cells = Sequence[Any] | npt.NDArray[Any]
 """The cells of a column: texts of a CSV file, numbers, or timestamps."""
 
 _NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
 _INDEX: Final = ("", "__index_level_0__")
-"""How files of pandas call an index without a name, in CSV and in Parquet."""
+"""Names that pandas writes for an index without a name, in CSV and in Parquet."""
 
 _BLANKS: Final = " \t\r\n"
 
 
 @dataclass(frozen=True, eq=False)
-class Column:
+class DataColumn:
     """A column of a table.
 
     Attributes:
@@ -37,7 +38,7 @@ class Column:
         name: Its name.
         cells: Texts, numbers, or moments of numpy.
         rows: The numbers of its rows in the file, shape (n,).
-        zone: Of moments, which are then those of UTC; None if they have none.
+        zone: Zone of moments, which are then those of UTC; None if they have none.
         may_have_commas: Whether a number may have a decimal comma.
         of_year: Whether its numbers are seconds of the year, which an error shows as dates.
     """
@@ -51,7 +52,7 @@ class Column:
     of_year: bool = False
 
     def told(self, index: int) -> str:
-        """Say where a cell stands."""
+        """Describe the place of a cell."""
         file = f"{self.table}, " if self.table else ""
         return f"{file}row {self.rows[index]}, column {shown(self.name)}"
 
@@ -81,7 +82,7 @@ class Column:
 
     @cached_property
     def numbers(self) -> FloatArray:
-        """Its numbers, shape (n,); NaN where a cell is empty.
+        """Numbers of the cells, shape (n,); NaN for an empty cell.
 
         Raises:
             ConfigError: If a cell is no number.
@@ -141,7 +142,7 @@ class Column:
         return Dates.of_instants(moments, zone_of("the time zone of the file", self.zone))
 
     def dates_in(self, zone: datetime.tzinfo | None) -> Dates:
-        """Its dates, those without an offset from UTC as a zone has them.
+        """Dates of the cells; a date without an offset from UTC is on the clock of a zone.
 
         Raises:
             ConfigError: As ``dates``; or if a date does not tell its offset there, or without a
@@ -181,19 +182,19 @@ def _is_number(cell: Any) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class DataTable:
     """The columns of a file.
 
     Attributes:
         columns: In the order of the file.
-        separator: What stands between cells, in words; "" where nothing does.
+        separator: Name of the separator of cells; "" for none.
         period: Seconds after which the rows repeat; None for one more row than there are.
         means: By name, for columns of means, the seconds before a row that it is the mean of.
         longest_gap: The longest time without a value, in seconds; None if nothing is known.
-        offset: That of its times, in seconds east of UTC, if its header tells it.
+        offset: Offset of its times, in seconds east of UTC, if its header tells it.
     """
 
-    columns: Sequence[Column]
+    columns: Sequence[DataColumn]
     separator: str = ""
     period: float | None = None
     means: Mapping[str, float] = field(default_factory=dict)
@@ -205,7 +206,7 @@ class Table:
         """The names of the columns."""
         return [column.name for column in self.columns]
 
-    def find(self, key: str | int) -> Column:
+    def find(self, key: str | int) -> DataColumn:
         """Find a column by its name, or by its number from 1 on.
 
         Raises:
@@ -224,7 +225,7 @@ class Table:
             raise unknown_name("column", key, self.names)
         return self.columns[numbers[0] - 1]
 
-    def find_time(self) -> Column | None:
+    def find_time(self) -> DataColumn | None:
         """Find the column of times by its usual names; None if there is none.
 
         Raises:

@@ -18,15 +18,15 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.pool.base import FloatArray
 
 __all__ = [
-    "CURE",
     "DAY",
     "HOUR",
+    "LOCAL_TIME_ADVICE",
     "REGULAR",
     "YEAR",
     "Dates",
-    "FloatArray",
     "IntArray",
     "moment_of_year",
     "offset_text",
@@ -35,7 +35,6 @@ __all__ = [
     "zone_of",
 ]
 
-FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 REGULAR: Final = 0.9
@@ -58,12 +57,12 @@ _YEAR_OF_RULES: Final = 2025
 """The year whose winter and summer tell the standard time of a zone."""
 
 _MONTHS_OF_SPRING: Final = (3, 4, 9, 10, 11)
-"""When clocks are set forward, in the north and in the south."""
+"""Months in which clocks are set forward, in the north and in the south."""
 
 Told = Callable[[int], str]
-"""Says where the row with an index stands."""
+"""Describes the place of a row by its index."""
 
-CURE: Final = (
+LOCAL_TIME_ADVICE: Final = (
     "If these are local times with daylight saving time, say of which zone: "
     'timezone = "Europe/Berlin"; if they are not, the offset: timezone = "+01:00"'
 )
@@ -154,7 +153,7 @@ class Dates:
     """The dates of rows.
 
     Attributes:
-        walls: What a clock on the wall shows, shape (n,).
+        walls: Local times without offsets, shape (n,).
         offsets: Seconds east of UTC, shape (n,); None if the dates do not tell them.
     """
 
@@ -192,7 +191,7 @@ class Dates:
         return cls(instants + own * _SECOND, own)
 
     def localized(self, zone: datetime.tzinfo, told: Told) -> Dates:
-        """Return dates without offsets with those of a zone.
+        """Give a zone's offsets to dates without an offset.
 
         Rows of an hour that the clock shows twice are told apart by their order.
 
@@ -216,7 +215,7 @@ class Dates:
         return Dates(self.walls, own)
 
     def _switch(self, rows: IntArray, zone: datetime.tzinfo, told: Told) -> int:
-        """How many rows of an hour that comes twice are those of its first time."""
+        """Number of rows in the first pass of an hour that comes twice."""
         falls = np.flatnonzero(np.diff(self.walls[rows]) <= 0)
         if len(falls) == 1:
             return int(falls[0]) + 1
@@ -260,12 +259,12 @@ class Dates:
             if is_spring and missing.hour < 4:
                 raise ConfigError(
                     f"{told(int(place) + 1)}: {shown_date(self.walls[place + 1])} follows "
-                    f"{shown_date(self.walls[place])}, an hour is missing. {CURE}"
+                    f"{shown_date(self.walls[place])}, an hour is missing. {LOCAL_TIME_ADVICE}"
                 )
 
 
 def _walls(dates: Sequence[datetime.datetime]) -> IntArray:
-    """What a clock on the wall shows; numpy itself takes five times as long for many."""
+    """Local times without their offsets; numpy takes five times as long for many."""
     days = np.fromiter(map(datetime.datetime.toordinal, dates), np.int64, len(dates))
     walls = (days - datetime.date(1970, 1, 1).toordinal()) * _DAY
     lengths = {"hour": _HOUR, "minute": 60 * _SECOND, "second": _SECOND, "microsecond": 1}
@@ -305,7 +304,7 @@ def _runs(rows: IntArray) -> list[IntArray]:
 
 
 def _changes(zone: datetime.tzinfo, moments: IntArray) -> tuple[IntArray, IntArray]:
-    """When the offset of a zone changes near some moments, and the offsets before and after."""
+    """Changes of a zone's offset near some moments, with the offsets before and after."""
     near = np.unique(np.unique(moments // _DAY)[:, None] + np.arange(-2, 3))
     try:
         offsets = [_offset(zone, int(day) * _DAY) for day in near]

@@ -1,4 +1,4 @@
-"""The sections of a task, read and checked against the FMU."""
+"""Sections of a task, read and checked against the FMU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fmugym.declared.file_lists import chosen_files, file_lists
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
 from fmugym.declared.kpis import read_kpi
-from fmugym.declared.parts import (
+from fmugym.declared.section_entries import (
     Limits,
     Term,
     read_derived,
@@ -32,8 +32,8 @@ from fmugym.declared.series import read_data
 from fmugym.declared.setpoints import SetPoints
 from fmugym.declared.spelling import as_declared
 from fmugym.declared.standard_time import standard_time
-from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, start_value
-from fmugym.declared.warming import read_warm_up
+from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, declared_start
+from fmugym.declared.warm_up_table import read_warm_up
 from fmugym.errors import ConfigError
 from fmugym.expressions.language import CONSTANTS, Expression
 from fmugym.expressions.mathematics import FUNCTIONS
@@ -54,7 +54,7 @@ def is_reserved(name: str) -> bool:
 
 
 class Declarations:
-    """What a task declares.
+    """Sections of a task, read and checked.
 
     Attributes:
         root: The table of all keys.
@@ -63,7 +63,7 @@ class Declarations:
             ``Task.physical``.
         parameters: Parameters and start values by alias: the variable, and a value or distribution
             in the unit of the FMU.
-        memory, derived: What the task remembers and names, by name.
+        memory, derived: Memory variables and named expressions, by name.
         series: Data and schedules by name.
         files: By episode variable, the numbers of the files that an episode may take.
         steps: Set points that jump, by name.
@@ -75,15 +75,15 @@ class Declarations:
         remembered: The names of which it sees the history.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
-        deviations: What the names of deviations from set points stand for.
-        kpis: What tells how good an episode was, by name.
-        warm_up: What happens before an episode begins.
+        deviations: Deviations from set points, by name.
+        kpis: KPIs by name.
+        warm_up: Warm-up before an episode.
     """
 
     def __init__(
         self, root: Entry, description: ModelDescription, is_physical: bool = False
     ) -> None:
-        """Read all sections, and note their mistakes, and what does not fit the FMU."""
+        """Read all sections, and note mistakes and values that do not fit the FMU."""
         root, self.name_of = as_declared(root, description)
         self.root, self.is_physical = root, is_physical
         self.variables = TaskVariables(root, description)
@@ -117,11 +117,11 @@ class Declarations:
 
     @property
     def own_names(self) -> list[str]:
-        """The names that are not those of variables, also those that have mistakes."""
+        """Names that belong to no variable, also if their entries have mistakes."""
         return [*self.memory, *self.derived, *self.series, *self.steps, *self._declared]
 
     def is_own(self, name: str) -> bool:
-        """Whether it is one of ``own_names``, of which there may be thousands."""
+        """Whether a name is in ``own_names``, which may have thousands."""
         return any(
             name in known
             for known in (self.memory, self.derived, self.series, self.steps, self._declared)
@@ -147,14 +147,14 @@ class Declarations:
         return found
 
     def _find(self, entry: Entry, role: str) -> TaskVariable | None:
-        """The variable of a name; None for a name that is not that of a variable."""
+        """Find the variable of a name; None for other names."""
         if self.is_own(entry.value):
             return None
         return self.variables.find(entry, entry.value, role, self.own_names)
 
     @property
     def measured(self) -> list[str]:
-        """The names of what the agent observes, and of what it observes the deviation."""
+        """Names that the agent observes, or whose deviation it observes."""
         names = [name for _, name in self.observed] + self.remembered
         return names + [self.deviations[name].of for name in names if name in self.deviations]
 
@@ -217,7 +217,7 @@ class Declarations:
 
     @property
     def normalization(self) -> str | None:
-        """What observations are normalized by: ``"limits"``, ``"nominal"``; None for nothing."""
+        """Divisor of observations: ``"limits"`` or ``"nominal"``; None for no normalization."""
         kind = self.agent("normalize").value
         if self.is_physical or not kind:
             return None
@@ -276,7 +276,7 @@ class Declarations:
                 del self.deviations[name]
 
     def _controlled(self) -> list[tuple[str, str]]:
-        """What is measured and its set point, in pairs, as far as the task tells.
+        """Pairs of a measured value and its set point, as far as the task tells them.
 
         Without set points ``of`` something, the only one is that of the only observed variable.
         """
@@ -303,7 +303,7 @@ class Declarations:
     def _with_fitted(
         self, parameters: dict[str, tuple[TaskVariable, Any]]
     ) -> dict[str, tuple[TaskVariable, Any]]:
-        """Parameters, and after them what a fit has found, which takes their place."""
+        """Parameters of the task, with the fitted ones in place of those of the same name."""
         entry = self.root.child("fitted")
         if entry.value is None:
             return parameters
@@ -313,13 +313,13 @@ class Declarations:
             for name, column in read_fitted(entry).items():
                 variable = self.variables.find(entry, aliases.get(name, name), "variable")
                 in_its_unit = replace(variable, conversion=IDENTITY)
-                value = start_value(in_its_unit, replace(entry, value=column))
+                value = declared_start(in_its_unit, replace(entry, value=column))
                 fitted[variable.alias] = variable, value
         return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
     def _parameter(self, entry: Entry) -> tuple[TaskVariable, Any]:
         variable = self.variables.find(entry, entry.name, "variable")
-        return variable, start_value(variable, entry)
+        return variable, declared_start(variable, entry)
 
     def _read_actions(self) -> list[TaskVariable]:
         actions: list[TaskVariable] = []

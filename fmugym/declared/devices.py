@@ -1,4 +1,4 @@
-"""Sensors and actuators: how what they give differs from what it should be."""
+"""Sensors and actuators: delay, bias, noise, limits, and lost samples."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class Device:
 
     Attributes:
         delay: By how many seconds it is late.
-        bias: What it adds: a number, or a distribution of one number in each episode.
+        bias: Added bias: a number, or a distribution of one number in each episode.
         noise: The standard deviation of what it adds in each step.
         saturation: The lowest and highest value that it gives; None for no limit.
         quantum: It gives multiples of this; 0 for any value.
         rate: The largest change in a second; infinite for no limit.
         drop_out: The probability that it gives no new value in a step.
-        substitute: What it gives then; None for the value before.
+        substitute: Value of a lost sample; None for the value before.
     """
 
     delay: float = 0.0
@@ -60,7 +60,7 @@ class Device:
 
     @property
     def remembers(self) -> bool:
-        """Whether what it gives depends on what it gave before."""
+        """Whether the present value depends on the value before."""
         return self.rate < math.inf or self.drop_out > 0
 
     def distorted(self, value: Value, count: Value, channel: int) -> Value:
@@ -120,7 +120,7 @@ def chance_in(count: Value, channel: int) -> Value:
 
 
 def first_step(graph: Graph) -> Value:
-    """The number 0 in each step: what is random and follows from it lasts for an episode."""
+    """Number 0 in each step, for random values that last for an episode."""
     return Value.read(graph, "step_count") * 0
 
 

@@ -1,4 +1,4 @@
-"""The values of a task, each of which knows where it stands in its file."""
+"""Entries of a task: values that know their places in the file."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _ASSIGNMENT: Final = re.compile(rf"\s*({_KEYS})\s*=")
 
 
 class Source(NamedTuple):
-    """A file, or a dict of the caller, that gives values of a task.
+    """Source of a task's values: a file, or a dict of the caller.
 
     Attributes:
         path: The file; None for a dict.
-        folder: Where relative paths start.
+        folder: Base of relative paths.
         text: The text of the file.
         document: Its values.
     """
@@ -47,7 +47,7 @@ class Source(NamedTuple):
         return True
 
     def place(self, keys: Sequence[str], element: str = "") -> str:
-        """Say where a value stands, or an element of a list, as far as that is known."""
+        """Find the place of a value, or of an element of a list, as far as it is known."""
         if self.path is None:
             return ".".join(keys)
         line = self.line(keys, element)
@@ -70,7 +70,7 @@ _Lines = dict[tuple[str, ...], int]
 
 @lru_cache(maxsize=32)
 def _lines(text: str) -> tuple[_Lines, _Lines]:
-    """The first lines that set keys, and those that set keys or what is in their tables."""
+    """Find the first line of each key, and the first line of each table and its parents."""
     wholes, parts = _Lines(), _Lines()
     for number, path in _paths(text):
         wholes.setdefault(path, number)
@@ -101,13 +101,13 @@ def _split(dotted: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Entry:
-    """A value of a task, and where it stands.
+    """A value of a task, and its place in the file.
 
     Attributes:
         value: The value.
         keys: The keys that lead to it.
         sources: The files that the task is made of; the first that has the value counts.
-        mistakes: Those that are known of the task.
+        mistakes: Mistakes that are known of the task.
         element: The text of an element of a list, which tells its line.
     """
 
@@ -132,7 +132,7 @@ class Entry:
         return self.sources[0]
 
     def error(self, text: object) -> TaskError:
-        """Make an error that says where this value stands."""
+        """Make an error that names the place of this value."""
         place = self.source.place(self.keys, self.element)
         return TaskError(printable(f"{place}: {text}" if place else text))
 
@@ -140,7 +140,7 @@ class Entry:
         """Make an error for values that are missing in this table, unless a mistake explains it.
 
         Args:
-            text: What is missing.
+            text: Description of the missing thing.
             keys: Their keys; none for this value itself.
         """
         places = [(*self.keys, key) for key in keys] or [self.keys]
@@ -155,7 +155,7 @@ class Entry:
 
     @contextmanager
     def placing(self) -> Iterator[None]:
-        """Let errors about this value say where it stands."""
+        """Add the place of this value to errors of a ``with`` block."""
         try:
             yield
         except TaskError:

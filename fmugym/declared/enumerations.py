@@ -1,4 +1,4 @@
-"""Enumerations that a task writes: each value that is known must be one of the items."""
+"""Checks of Enumerations: each value that a task writes must be one of the items."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fmugym.distributions import Choice
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
     from fmugym.declared.entries import Entry
-    from fmugym.declared.parts import Memory
+    from fmugym.declared.section_entries import MemoryVariable
     from fmugym.declared.variables import TaskVariable
     from fmugym.expressions.value import Value
 
@@ -56,15 +56,15 @@ def check_controller(entry: Entry, variable: TaskVariable, controller: Controlle
 
 
 def check_written(
-    entry: Entry, variable: TaskVariable, value: Value, memory: Mapping[str, Memory]
+    entry: Entry, variable: TaskVariable, value: Value, memory: Mapping[str, MemoryVariable]
 ) -> None:
-    """Check what an expression writes to an Enumeration, as far as that is known.
+    """Check the known values of an expression that is written to an Enumeration.
 
     Args:
-        entry: Where the expression stands.
-        variable: What it writes.
+        entry: Entry of the task.
+        variable: Written variable.
         value: Its value.
-        memory: What the task remembers, by name.
+        memory: Memory variables of the task, by name.
 
     Raises:
         ConfigError: If it writes a number that is no item.
@@ -79,8 +79,8 @@ def _require_items(entry: Entry, variable: Variable, values: Iterable[float]) ->
             checked_value(variable, value)
 
 
-def _known(value: Value, memory: Mapping[str, Memory]) -> Iterator[float]:
-    """What a value is at one time or another, as far as that is known."""
+def _known(value: Value, memory: Mapping[str, MemoryVariable]) -> Iterator[float]:
+    """Values that are known to occur at one time or another."""
     graph, waiting = value.graph, [value.node]
     while waiting:
         node = graph.nodes[waiting.pop()]

@@ -1,4 +1,4 @@
-"""Lists of files of data, of which an episode draws one."""
+"""Lists of data files, one of which is drawn for each episode."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FileLists = Mapping[str, Sequence[Sequence[str]]]
 
 
 def listed_files(entry: Entry) -> list[str]:
-    """The paths of the files of a series; those that fit a pattern in the order of their names.
+    """Paths of the files of a series; files that fit a pattern come in the order of their names.
 
     Raises:
         ConfigError: If there is none, or one comes twice.
@@ -68,7 +68,7 @@ def variable_of(entry: Entry) -> str:
 
 
 def file_lists(root: Entry) -> FileLists:
-    """The lists of a task, with what an episode draws from them.
+    """Lists of files of a task, and the distributions that draw one for each episode.
 
     Raises:
         ConfigError: If lists that share their number differ in their lengths.

@@ -1,4 +1,4 @@
-"""What a fit to logs of a plant has found, of which an episode draws a row."""
+"""Results of a fit to logs of a plant: rows of parameters, one of which an episode draws."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from fmugym.checks import require_regular
 from fmugym.declared.entries import Entry
-from fmugym.distributions import Column
+from fmugym.distributions import DrawnColumn
 from fmugym.errors import ConfigError, shown
 
 __all__ = ["read_fitted"]
 
 
-def read_fitted(entry: Entry) -> dict[str, Column]:
+def read_fitted(entry: Entry) -> dict[str, DrawnColumn]:
     """Read a file of ``fmugym.fit.write_rows``.
 
     Args:
@@ -40,7 +40,7 @@ def read_fitted(entry: Entry) -> dict[str, Column]:
         if not (is_table and rows.size and np.isfinite(rows).all()):
             raise _not_fitted(path)
     columns = zip(names, rows.T.tolist(), strict=True)
-    return {str(name): Column(values, table=str(path)) for name, values in columns}
+    return {str(name): DrawnColumn(values, table=str(path)) for name, values in columns}
 
 
 def _not_fitted(path: object) -> ConfigError:

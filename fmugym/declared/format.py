@@ -40,7 +40,7 @@ from fmugym.keys import (
     Listed,
     Table,
     option,
-    table_of,
+    table_of_fields,
 )
 from fmugym.pool.spec import SAMPLINGS
 from fmugym.systems.components import Component
@@ -49,7 +49,7 @@ from fmugym.systems.wired import SYSTEM
 __all__ = ["AGENT", "DEVICE", "KPI", "PLANT", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
 
 SCHEMA: Final = Path(__file__).parent / "task.schema.json"
-"""What the keys are, for editors; ``docs/_site/keys.py`` writes it."""
+"""JSON Schema of the keys, for editors; ``docs/_site/keys.py`` writes it."""
 
 VERSION: Final = 1
 """The version of the format; it is raised when a key changes its meaning."""
@@ -64,11 +64,11 @@ _MOST_NAMES: Final = 5000
 _NORMALIZATIONS: Final = ("limits", "nominal")
 
 
-# What single values may be.
+# Checks of single values.
 
 
 def _within(read: Callable[[str, Any], float], **limits: Any) -> Callable[[str, Any], float]:
-    """A check of what another one reads, as in ``check_number``."""
+    """Make a check of limits for the result of another check, as in ``check_number``."""
     return lambda what, value: check_number(what, read(what, value), **limits)
 
 
@@ -242,9 +242,11 @@ _NUMBERS: Final = {"title": "list of numbers", "type": "array", "items": _NUMERI
 _MOMENT: Final = {**_TIME, "title": "time, date"}
 
 ANYTHING: Final = Kind(lambda _, value: value, {"title": "anything"})
-NUMBER: Final = Kind(number, _NUMERIC)
+NUMERIC: Final = Kind(number, _NUMERIC)
 FINITE: Final = Kind(finite, _NUMERIC)
-POSITIVE: Final = Kind(_within(number, positive=True), {**_NUMERIC, "title": "positive number"})
+POSITIVE_NUMBER: Final = Kind(
+    _within(number, positive=True), {**_NUMERIC, "title": "positive number"}
+)
 TIME: Final = Kind(_time, _TIME)
 POSITIVE_TIME: Final = Kind(_within(_time, positive=True), {**_TIME, "title": "positive time"})
 DEVIATION: Final = Kind(_within(number, minimum=0), {**_NUMERIC, "title": "number from 0 on"})
@@ -252,7 +254,7 @@ DRAWN: Final = Kind(number_or_distribution, _DRAWN)
 TIME_OR_DRAWN: Final = Kind(
     partial(number_or_distribution, read=_time), {**_DRAWN, "title": "time, distribution"}
 )
-NUMBERS: Final = Kind(_numbers, _NUMBERS)
+NUMBER_LIST: Final = Kind(_numbers, _NUMBERS)
 VALUES: Final = Kind(_values, _NUMBERS)
 NAMES: Final = Listed(TEXT, or_one=True, most=_MOST_NAMES)
 PATH: Final = Kind(_path, {"title": "path", **TEXT.schema}, "path")
@@ -268,8 +270,8 @@ TIMEZONE: Final = Kind(zone_of, TEXT.schema)
 GAPS: Final = Kind(_gaps, {"title": '"interpolate", time', "type": ["number", "string"]})
 
 _LIMITS: Final = {
-    "min": Key(NUMBER, "Lower limit for the observation space.", None, "no limit"),
-    "max": Key(NUMBER, "Upper limit for the observation space.", None, "no limit"),
+    "min": Key(NUMERIC, "Lower limit for the observation space.", None, "no limit"),
+    "max": Key(NUMERIC, "Upper limit for the observation space.", None, "no limit"),
 }
 _DESCRIPTION: Final = {"description": Key(TEXT, "A description for readers.")}
 
@@ -282,7 +284,7 @@ def _evaluated(check: Callable[[str, Any], Any], what: str, value: Any) -> Any:
 
 
 def _taking_expressions(kind: Any) -> Any:
-    """The same kind, or a table of such, where expressions of constants stand for numbers, too."""
+    """Let a kind, or all kinds of a table, take expressions of constants for numbers."""
     match kind:
         case Kind() if kind.schema.get("type") in ("number", "integer"):
             schema = {**kind.schema, "type": [kind.schema["type"], "string"]}
@@ -299,7 +301,7 @@ def _taking_expressions(kind: Any) -> Any:
     return kind
 
 
-COUNT: Final = _taking_expressions(INTEGER)
+_COUNT: Final = _taking_expressions(INTEGER)
 
 
 # Variables.
@@ -311,13 +313,17 @@ DEVICE: Final = {
         "This is added: a number, or one that is drawn in each episode from a uniform or normal "
         "distribution.",
     ),
-    "noise": Key(POSITIVE, "The standard deviation of normally distributed noise that is added."),
+    "noise": Key(
+        POSITIVE_NUMBER, "The standard deviation of normally distributed noise that is added."
+    ),
     "saturation": Key(
         Kind(_saturation, {**_NUMBERS, "title": "list of two numbers"}),
         "The lowest and the highest value, such as `[0, 40]`.",
     ),
-    "quantum": Key(POSITIVE, "The value is a multiple of this, as of a converter with few digits."),
-    "rate": Key(POSITIVE, "The value changes by at most this much in a second."),
+    "quantum": Key(
+        POSITIVE_NUMBER, "The value is a multiple of this, as of a converter with few digits."
+    ),
+    "rate": Key(POSITIVE_NUMBER, "The value changes by at most this much in a second."),
     "drop_out": Key(
         Table(
             {
@@ -354,15 +360,15 @@ VARIABLE: Final = Table(
             "the FMU's",
         ),
         "min": Key(
-            NUMBER,
+            NUMERIC,
             "Lower limit for the spaces, and for the [range](config.md#ranges) of parameters and "
             "start values. It clips nothing.",
             None,
             "the FMU's",
         ),
-        "max": Key(NUMBER, "Upper limit, as `min`.", None, "the FMU's"),
+        "max": Key(NUMERIC, "Upper limit, as `min`.", None, "the FMU's"),
         "nominal": Key(
-            POSITIVE,
+            POSITIVE_NUMBER,
             "The usual size of the values, for observations that are "
             "[normalized](task-file.md#agent) by it.",
             None,
@@ -377,7 +383,7 @@ VARIABLE: Final = Table(
             "[Controllers](task-file.md#what-controllers-see-and-write) write values.",
         ),
         "delta": Key(
-            POSITIVE,
+            POSITIVE_NUMBER,
             "An action changes by at most this much in each step. The agent chooses the change "
             "instead of the value.",
         ),
@@ -546,8 +552,8 @@ DATA: Final = Table(
             "An input of the FMU that is set to the value at the beginning of each step, in its "
             "own unit.",
         ),
-        "min": Key(NUMBER, _LIMITS["min"].text, None, "that of the values"),
-        "max": Key(NUMBER, _LIMITS["max"].text, None, "that of the values"),
+        "min": Key(NUMERIC, _LIMITS["min"].text, None, "that of the values"),
+        "max": Key(NUMERIC, _LIMITS["max"].text, None, "that of the values"),
     }
 )
 
@@ -571,8 +577,8 @@ SINE: Final = Table(
 
 STEPS: Final = Table(
     {
-        "low": Key(NUMBER, "The lowest value.", REQUIRED),
-        "high": Key(NUMBER, "The highest value.", REQUIRED),
+        "low": Key(NUMERIC, "The lowest value.", REQUIRED),
+        "high": Key(NUMERIC, "The highest value.", REQUIRED),
         "every": Key(POSITIVE_TIME, "Time from one value to the next.", REQUIRED),
     }
 )
@@ -581,7 +587,7 @@ SETPOINT: Final = Table(
     {
         "value": Key(DRAWN, "Constant, or drawn if it is a distribution. `21` is short for this."),
         "schedule": Key(
-            Entries(NUMBER),
+            Entries(NUMERIC),
             '`{ "06:00" = 21, "22:00" = 17 }`: the values from these times of a day on.',
         ),
         "steps": Key(
@@ -606,7 +612,7 @@ SETPOINT: Final = Table(
 )
 
 
-# When episodes begin, and what acts before.
+# Beginnings of episodes, and warm-ups.
 
 
 SEASON: Final = Table(
@@ -646,8 +652,8 @@ SCENARIO: Final = Table(
 SIGNAL: Final = Table(
     {
         "controller": Key(TEXT, "What gives the signal.", REQUIRED),
-        "min": Key(NUMBER, "Its lowest value.", REQUIRED),
-        "max": Key(NUMBER, "Its highest value.", REQUIRED),
+        "min": Key(NUMERIC, "Its lowest value.", REQUIRED),
+        "max": Key(NUMERIC, "Its highest value.", REQUIRED),
     },
     what="key of a signal",
 )
@@ -675,7 +681,7 @@ WARM_UP: Final = Table(
 )
 
 
-# What is computed.
+# Computed values.
 
 
 def _named(**more: Key) -> Table:
@@ -688,7 +694,7 @@ NAMED: Final = _named(**_LIMITS)
 
 REWARD: Final = _named(weight=Key(FINITE, "Factor of the reward.", 1.0))
 
-COST: Final = _named(limit=Key(NUMBER, "What the costs of an episode may add up to."))
+COST: Final = _named(limit=Key(NUMERIC, "What the costs of an episode may add up to."))
 
 MEMORY: Final = Table(
     {
@@ -749,8 +755,8 @@ _ADDRESSES: Final = {
         "big",
     ),
     "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", None, "that of the plant"),
-    "scale": Key(NUMBER, "What the plant's number is multiplied by.", 1.0),
-    "offset": Key(NUMBER, "What is added then.", 0.0),
+    "scale": Key(NUMERIC, "What the plant's number is multiplied by.", 1.0),
+    "offset": Key(NUMERIC, "What is added then.", 0.0),
 }
 
 TAG: Final = Table(
@@ -770,7 +776,7 @@ LIVE: Final = Table(
         "file": DATA.keys["file"]._replace(kind=PATH, text="The file."),
         **_ADDRESSES,
         "count": Key(
-            COUNT,
+            _COUNT,
             "How many values a tag has: those of now, and of each `step` ahead. One value alone "
             "holds.",
             1,
@@ -850,7 +856,7 @@ _FMU: Final = Either(BUNDLED, PATH)
 
 COMPONENT: Final = Table(
     {
-        **_taking_expressions(table_of(Component)).keys,
+        **_taking_expressions(table_of_fields(Component)).keys,
         "fmu": Key(_FMU, "Path of the FMU; it alone is short for this."),
         "bundled": Key(TEXT, 'Or the name of an FMU of fmugym, such as `"House"`.'),
         **_VERSION_OF_FMI,
@@ -895,7 +901,7 @@ _OF_SECTIONS: Final = {
         "it stands above [config]",
     ),
 }
-"""Keys of a config that other sections of a task determine, and how."""
+"""Keys of a config that other sections of a task determine, with the section to use."""
 
 CONFIG_OF_TASK: Final = _taking_expressions(
     Table(
@@ -929,7 +935,7 @@ TASK: Final = Table(
         ),
         "arguments": Key(Entries(ANYTHING), "Arguments of that class."),
         "time_step": Key(POSITIVE_TIME, "Length of a step.", None, "the FMU's"),
-        "substeps": Key(COUNT, "Number of communication steps in one step.", None, "`1`"),
+        "substeps": Key(_COUNT, "Number of communication steps in one step.", None, "`1`"),
         "episode_length": Key(
             TIME,
             "Time after which an episode is truncated; a multiple of the time step.",

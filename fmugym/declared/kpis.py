@@ -1,4 +1,4 @@
-"""Figures that tell how good an episode was: what is computed of the values in its steps."""
+"""KPIs: sums, means and other figures of the values in the steps of an episode."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Kpi(NamedTuple):
     """A figure of an episode.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         expression: Its value in a step; or an expression of other figures.
         how: The key of the format that has the expression; None for an expression of other figures.
     """
@@ -27,7 +27,7 @@ class Kpi(NamedTuple):
     how: str | None
 
     def updated(self, value: Value, step_count: Value) -> Value:
-        """What the task remembers of a figure after a step.
+        """Value of a figure in the memory of the task after a step.
 
         Args:
             value: The value in the step.

@@ -1,4 +1,4 @@
-"""Likely units of variables to which the FMU gives none."""
+"""Guesses of the units of variables to which the FMU gives no unit."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _USUAL: Final[Mapping[str, tuple[float, float]]] = {
 """The values that such variables have."""
 
 _MOST_OF_A_SHARE: Final = 1.5
-"""Per cent are known by values above this, where 1 would be all."""
+"""Values above this are per cent, where a share is at most 1."""
 
 _CANDIDATES: Final = (
     *("K", "degC", "Pa", "%", "1", "W", "J", "m", "m/s", "m3/s", "kg/s", "rad", "rad/s"),
@@ -74,7 +74,7 @@ _CANDIDATES: Final = (
 
 
 def likely_units(description: ModelDescription) -> dict[str, str]:
-    """Units of inputs, outputs and locals without one, by name: by what the description says.
+    """Guess units from descriptions, for inputs, outputs and locals without one, by name.
 
     A temperature without a start value is in kelvin where others of the FMU are.
     """
@@ -229,12 +229,12 @@ def _lie_within(seen: tuple[float, float], limits: tuple[float, float]) -> bool:
 
 @dataclass(frozen=True)
 class Misreading:
-    """A variable without a unit that the FMU seems to mean in another one than the task.
+    """Suspicion that the FMU means a variable in another unit than the task.
 
     Attributes:
         name: Its name in the task.
-        text: What tells it.
-        line: What to write in ``[variables]``.
+        text: Description of the reason.
+        line: Line for ``[variables]``.
         contradicts: Whether its values contradict its limits in the task.
         is_converted: Whether the task takes it for a unit.
     """
@@ -347,7 +347,7 @@ def _contradiction(
 def _surprise(
     name: str, variable: Variable, values: Sequence[float], wanted: str | None, line: str
 ) -> Misreading | None:
-    """A variable that looks like one of another unit than the task takes it for."""
+    """Describe a variable whose values look as if they were in another unit."""
     unit = likely_unit(variable, values, wanted)
     if unit is None or unit == wanted:
         return None

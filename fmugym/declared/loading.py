@@ -77,7 +77,7 @@ def _class_of(entry: Entry) -> type[FMUEnv]:
 
 
 def _imported(entry: Entry) -> Any:
-    """What ``"module:name"`` stands for."""
+    """Import the object that ``"module:name"`` names."""
     module, separator, name = entry.value.partition(":")
     if not (separator and module and name):
         raise entry.error(f"expected 'module:Class' of an environment, got {shown(entry.value)}")

@@ -1,4 +1,4 @@
-"""The mistakes of a task, which are found in one go."""
+"""Mistakes of a task, which are collected and reported together."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from fmugym.errors import TaskError
 
 __all__ = ["Mistakes"]
 
-Keys = tuple[str, ...]
+_Keys = tuple[str, ...]
 
 _MOST: Final = 100
 """Mistakes that one error tells, at most."""
 
 
 class Mistakes:
-    """What is wrong with a task, by the keys of the values that are wrong.
+    """Mistakes of a task, by the keys of the wrong values.
 
     What only follows from a mistake is none: whatever needs a value that could not be read raises
     ``ConsequenceError``, which is not noted.
@@ -25,16 +25,18 @@ class Mistakes:
     """
 
     def __init__(self) -> None:
-        self._found: dict[str, tuple[Keys, tuple[int, int]]] = {}
-        self._unknown: set[Keys] = set()
-        self._consequences: dict[Keys, str] = {}
+        self._found: dict[str, tuple[_Keys, tuple[int, int]]] = {}
+        self._unknown: set[_Keys] = set()
+        self._consequences: dict[_Keys, str] = {}
         self.hidden: set[str] = set()
 
-    def note(self, text: str, keys: Keys, place: tuple[int, int], is_unknown: bool = False) -> None:
+    def note(
+        self, text: str, keys: _Keys, place: tuple[int, int], is_unknown: bool = False
+    ) -> None:
         """Note a mistake.
 
         Args:
-            text: What is wrong, and where.
+            text: Description of the mistake and its place.
             keys: The keys of the value.
             place: The number of its file, and the line; mistakes are told in this order.
             is_unknown: Whether there is no key of this name.
@@ -46,7 +48,7 @@ class Mistakes:
         if is_unknown:
             self._unknown.add(keys)
 
-    def note_consequence(self, text: str, keys: Keys) -> None:
+    def note_consequence(self, text: str, keys: _Keys) -> None:
         """Note that a value under these keys cannot be had because of another mistake."""
         self._consequences.setdefault(keys, text)
 
@@ -55,8 +57,8 @@ class Mistakes:
         """The keys of the task that do not exist."""
         return [keys[0] for keys in self._unknown if len(keys) == 1]
 
-    def explain(self, keys: Keys) -> bool:
-        """Whether a mistake may be the reason why there is no value under these keys.
+    def explain(self, keys: _Keys) -> bool:
+        """Whether a noted mistake may be the reason for a missing value under these keys.
 
         It is in the value, in the table that should have it, or in the name of a key of the table.
         """

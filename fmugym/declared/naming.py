@@ -1,4 +1,4 @@
-"""What the names in the expressions of a task stand for: values of the environment."""
+"""Names in the expressions of a task, and the values of the environment that they read."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 
 
 class Moment(Enum):
-    """When an expression is evaluated."""
+    """Moment at which an expression is evaluated."""
 
     BEFORE = "before the FMU steps"
     AFTER = "after the FMU has stepped"
@@ -40,7 +40,7 @@ class Moment(Enum):
 
 
 _OVER: Final = (Moment.AFTER, Moment.JUDGED, Moment.UPDATED)
-"""The moments in which a value that holds for a while is that of the step that has just ended."""
+"""Moments after a step, at which a value that holds is still the value of that step."""
 
 CLOCK: Final = "clock"
 """The episode variable with the time of data at the beginning of an episode."""
@@ -54,14 +54,14 @@ So the rounding of times does not matter.
 """
 
 
-NO_NAMES: Final[Mapping[str, Value]] = {}
+_NO_NAMES: Final[Mapping[str, Value]] = {}
 
 _CHANNELS_OF_ACTUATORS: Final = 5_000
 _LONGEST_DELAY: Final = 2000
 
 
 def switch_names(variable: TaskVariable) -> tuple[str, str]:
-    """The episode variables that know whether an action is on, and for how many steps."""
+    """Names of the episode variables for whether an action is on, and since how many steps."""
     return f"{variable.alias} is on", f"steps since {variable.alias} was switched"
 
 
@@ -98,7 +98,7 @@ class Naming:
         self.outputs, self.monitors = self._read_names()
 
     def _read_names(self) -> tuple[list[str], list[str]]:
-        """Observed variables come first, and next those whose previous values are needed."""
+        """List observed variables first, and then variables whose previous values are needed."""
         declared, expressions = self.declared, self.declared.expressions
         observed = declared.measured
         previous = sorted(set().union(*(e.previous_names for e in expressions)))
@@ -114,7 +114,7 @@ class Naming:
         return (outputs, self._firsts[len(outputs) :]) if outputs else (self._firsts, [])
 
     def _find_places(self, names: list[str]) -> dict[str, int]:
-        """Where the values of names are: several may stand for one variable of the FMU.
+        """Find the places of the values; several names may share one variable of the FMU.
 
         ``_firsts`` are the names that come first for their variables. Several must be sampled in
         one way: a step gives one value of each.
@@ -141,7 +141,7 @@ class Naming:
         return list(self._places)
 
     def _is_output(self, name: str) -> bool:
-        """Whether a name stands for one of the values in ``state``."""
+        """Whether the value of a name is in ``state``."""
         return self._places.get(name, len(self.outputs)) < len(self.outputs)
 
     def channel_of(self, name: str) -> int:
@@ -168,12 +168,12 @@ class Naming:
         entry: Entry,
         expression: Expression,
         moment: Moment,
-        others: Mapping[str, Value] = NO_NAMES,
+        others: Mapping[str, Value] = _NO_NAMES,
     ) -> Value:
         """Evaluate an expression.
 
         Args:
-            entry: Where it stands.
+            entry: Entry of the task.
             expression: The expression.
             moment: When it is evaluated.
             others: The values of more names.
@@ -236,7 +236,7 @@ class Naming:
         """The value of a name at another time.
 
         Args:
-            entry: Where the forecast stands.
+            entry: Entry of the task.
             name: Something that depends on time only.
             ahead: Seconds from now; negative for the past.
 
@@ -263,7 +263,7 @@ class Naming:
         return self.read("variables", name)
 
     def _value_of_series(self, name: str, moment: Moment) -> Value:
-        """The value now. One that holds for a while is, after a step, that of the step."""
+        """Present value of a series; after a step, a value that holds is that of the step."""
         series, shift = self.declared.series[name], self._ahead
         lookup = self._lookup_of(name, series)
         distance = distance_of(lookup.spans)
@@ -300,7 +300,7 @@ class Naming:
         return number.taken(table)
 
     def _value_of_steps(self, name: str, moment: Moment) -> Value:
-        """The random value now; after a step, that of the step."""
+        """Random value of this step, also after the step."""
         steps = self.declared.steps[name]
         count = steps_in(steps.entry, steps.every, self.time_step)
         shift = nearest_steps(self._ahead, self.time_step) - (moment in _OVER)
@@ -326,7 +326,7 @@ class Naming:
 
     @property
     def clock(self) -> Value:
-        """The time of data now; that of the FMU if the task sets no other clock."""
+        """Present time of data; the FMU's time if the task sets no other clock."""
         if self.declared.root.child("clock").value is None:
             return self.read("time")
         return self.read("variables", CLOCK) + self.step_count * self.time_step
@@ -353,7 +353,7 @@ class Naming:
         return value
 
     def _needed_for(self, name: str, moment: Moment) -> list[str]:
-        """A named expression, after those that it reads; without those that count as known.
+        """A named expression after the ones that it reads, without names that count as known.
 
         From now on they all count so. Thousands may read each other in a row.
         """
@@ -456,7 +456,7 @@ class Naming:
         return self.declared.actions.index(variable)
 
     def delay_of(self, variable: TaskVariable) -> int:
-        """By how many steps a sensor or an actuator is late.
+        """Delay of a sensor or an actuator, in steps.
 
         Raises:
             ConfigError: If the delay is no multiple of the time step.
@@ -465,14 +465,14 @@ class Naming:
         return steps_in(entry, delay, self.time_step, _LONGEST_DELAY) if delay else 0
 
     def _late(self, variable: TaskVariable) -> Value:
-        """What the agent chose some steps ago."""
+        """Action that the agent chose some steps ago."""
         count = self.delay_of(variable)
         queued = self.read("variables", queue_name(variable), count - 1)
         is_first = self.step_count < float(count - self.warm_steps)
         return where(is_first, self.start(variable), queued)
 
     def start(self, variable: TaskVariable) -> Value:
-        """What counts as chosen before the first action; no change for changes."""
+        """Value that counts as chosen before the first action; 0 for changes."""
         if variable.delta and not self.declared.is_physical:
             return self.step_count * 0.0
         return self._start_of_input(variable)
@@ -532,7 +532,7 @@ class Naming:
         return place.taken(self._table_of_levels(variable, levels))
 
     def kept(self, name: str) -> tuple[Value, Value] | None:
-        """What a history adds to a name's values in each step.
+        """Values of a name that a history keeps in each step.
 
         Returns:
             The value to add, and the older values in the first step; None if there is no history of

@@ -35,7 +35,7 @@ def steps_in(entry: Entry, length: float, step: float, most: float = math.inf) -
     """The number of steps in a duration.
 
     Args:
-        entry: Where the duration stands.
+        entry: Entry of the task.
         length: The duration in seconds.
         step: The length of a step in seconds.
         most: There may be at most so many.

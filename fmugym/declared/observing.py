@@ -1,4 +1,4 @@
-"""What the agent observes: values, forecasts and histories."""
+"""Observations of the agent: values, forecasts and histories."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
 from fmugym.declared.numbers import nearest_steps, steps_in
-from fmugym.declared.parts import Limits
+from fmugym.declared.section_entries import Limits
 from fmugym.declared.variables import TaskVariable
 from fmugym.expressions.value import Value, where
 
@@ -65,8 +65,8 @@ class Seen(NamedTuple):
     """A number that the agent observes.
 
     Attributes:
-        entry: Where it is declared.
-        name: What it is the value of.
+        entry: Entry of the task.
+        name: Name of the value.
         value: Its value.
         limits: Its limits.
         place: Which value of a forecast or history it is, such as ``"[+3600 s]"``.
@@ -85,7 +85,7 @@ class History(NamedTuple):
     Attributes:
         name: The name.
         variable: The episode variable that holds them, the latest first.
-        length: How many they are.
+        length: Number of the values.
         now: The value that is added when the FMU has stepped.
         fill: The other values in the first step.
         first: All values at the beginning of an episode.
@@ -130,7 +130,7 @@ def histories(naming: Naming) -> list[History]:
 
 
 def _kept_steps(naming: Naming) -> int:
-    """How many values of a name the agent sees that are of the past."""
+    """Number of past values of a name that the agent observes."""
     entry, steps = naming.declared.root.child("agent").child("history").child("length"), 0
     with entry.noting():
         if entry.value is not None:
@@ -139,7 +139,7 @@ def _kept_steps(naming: Naming) -> int:
 
 
 def _queue(naming: Naming, variable: TaskVariable) -> History:
-    """What the agent has chosen for an action with a delay."""
+    """Chosen actions that a delay still keeps."""
     name, start = queue_name(variable), naming.start(variable)
     chosen = naming.action(variable, "action")
     return History(name, name, naming.delay_of(variable), chosen, start, start)
@@ -156,12 +156,12 @@ def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
 
 
 def _sensor_of(declared: Declarations, name: str) -> TaskVariable | None:
-    """The variable of what is measured; None for what the agent knows without a sensor."""
+    """Variable of a measured name; None for a name that the agent knows without a sensor."""
     return declared.variables.get(name) if declared.is_output(name) else None
 
 
 def observed_values(naming: Naming, kept: list[History]) -> tuple[list[Seen], list[History]]:
-    """The numbers that the agent observes, in their order, and what sensors remember.
+    """Observed numbers in their order, and the memories of sensors.
 
     Args:
         naming: Gives names their values.
@@ -176,7 +176,7 @@ def observed_values(naming: Naming, kept: list[History]) -> tuple[list[Seen], li
 
 
 def _check_sensors(declared: Declarations) -> None:
-    """Refuse a sensor of what the agent does not observe: it would do nothing."""
+    """Refuse a sensor of a variable that the agent does not observe, which has no effect."""
     seen, mistakes = set(declared.measured), declared.root.mistakes
     if any(mistakes.explain(("agent", key)) for key in ("actions", "observations", "history")):
         return
@@ -199,7 +199,7 @@ class _Past:
         self._histories = {history.name: history for history in kept}
 
     def measured(self, entry: Entry, name: str, ago: int) -> Value:
-        """What the agent measured some steps ago."""
+        """Value that the agent measured some steps ago."""
         variable = _sensor_of(self._declared, name)
         deviation = self._declared.deviations.get(name)
         if deviation is not None:
@@ -225,7 +225,7 @@ class _Past:
         return device.distorted(value, self._naming.step_count - ago, self._naming.channel_of(name))
 
     def _kept(self, entry: Entry, variable: TaskVariable, ago: int) -> str:
-        """The variable with what a sensor with a memory has given, the latest first."""
+        """Variable that keeps the readings of a sensor with a memory, the latest first."""
         name, kept = variable.alias, f"measured {variable.alias}"
         naming, fill = self._naming, self._fresh(entry, variable, 1)
         length = max(ago + 1, self._measured[name].length if name in self._measured else 0)
@@ -239,7 +239,7 @@ class _Past:
 
     @property
     def memories(self) -> list[History]:
-        """What sensors with a memory have given; to be updated after the histories."""
+        """Readings of sensors with a memory, which are updated after the histories."""
         return list(self._measured.values())
 
     def _true(self, entry: Entry, name: str, ago: int) -> Value:
@@ -292,7 +292,7 @@ def _with_error(
 
     Args:
         value: The true value.
-        errors: How forecasts err, by the keys of the format.
+        errors: Errors of forecasts, by the keys of the format.
         part: The time ahead as a part of the horizon.
         count: The number of the step that the forecast is made for.
         channel: The number of the forecast.
@@ -345,7 +345,7 @@ def normalized(seen: Seen, nominal: float | None) -> Seen:
 
 
 def scaled(seen: Seen) -> Seen:
-    """Scale a value so that it lies between -1 and 1 where it is within its limits.
+    """Scale a value from its limits to the range from -1 to 1.
 
     Raises:
         ConfigError: If a limit is infinite.

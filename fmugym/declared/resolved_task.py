@@ -1,4 +1,4 @@
-"""From a declared task and a model description to a config, spaces and hooks."""
+"""Resolution of a task: its declarations and a model description make a config and hooks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
-from fmugym.declared.blaming import explanation
 from fmugym.declared.configuring import (
     beginning_of,
     bounds_of,
@@ -21,11 +20,11 @@ from fmugym.declared.configuring import (
     times_of,
 )
 from fmugym.declared.declarations import Declarations
+from fmugym.declared.declared_quantities import named_values
 from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.enumerations import check_written
 from fmugym.declared.kpis import Kpi, kpi_name
-from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
 from fmugym.declared.numbers import steps_in
 from fmugym.declared.observing import (
@@ -38,11 +37,12 @@ from fmugym.declared.observing import (
     remembered,
     scaled,
 )
-from fmugym.declared.parts import Term
-from fmugym.declared.piloting import DeclaredWarmUp
+from fmugym.declared.reward_explanation import explanation
 from fmugym.declared.seasons import held_out_times
+from fmugym.declared.section_entries import Term
 from fmugym.declared.task import Task
-from fmugym.declared.variables import TaskVariable, is_plain
+from fmugym.declared.variables import TaskVariable, has_fmu_values
+from fmugym.declared.warm_up_controllers import DeclaredWarmUp
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of, update_by
@@ -55,17 +55,17 @@ from fmugym.task.quantity import Quantities
 
 __all__ = ["ResolvedTask"]
 
-WORST: Final = "worst reward"
+_WORST: Final = "worst reward"
 """The episode variable with the lowest reward until now, or 0."""
 
 _LONG_AGO: Final = 1e9
 """Steps since an action was switched, at the beginning of an episode."""
 
-Hook = Callable[..., Any]
+_Hook = Callable[..., Any]
 
 
 class ResolvedTask:
-    """What an environment needs to know of its task.
+    """Config, spaces and hooks of an environment, made of a declared task.
 
     Args:
         task: The task.
@@ -75,15 +75,15 @@ class ResolvedTask:
 
     Attributes:
         config: The config for ``FMUEnv``.
-        formulas: What the task computes.
+        formulas: Formulas of the task.
         hooks: Functions of the environment by the names of the hooks that they are, for spaces and
             for what is said of rewards.
         observation_names: The names of the elements of the observation.
-        action_names: Those of the action.
+        action_names: Names of the action's elements.
         action_masks: A function of the environment that tells which levels of the actions are not
             blocked, shape (levels,); None if an action has no levels.
-        warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
-        cost_limits: What the costs of an episode may add up to, by name.
+        warm_up: Controllers of warm-ups; None if there is none, or inputs do not move in it.
+        cost_limits: Limits of the costs of an episode, by name.
         unphysical_keys: The keys for which observations or actions are not in the task's units.
         expressions: All expressions of the task.
 
@@ -119,7 +119,7 @@ class ResolvedTask:
         root.mistakes.require_none()
 
     def _make(self) -> None:
-        """Make what the attributes are."""
+        """Make the values of the attributes."""
         declared = self._declared
         self.config = self._make_config()
         self.formulas = self._make_formulas()
@@ -134,7 +134,7 @@ class ResolvedTask:
 
     @property
     def future(self) -> Future:
-        """What hooks read of the future."""
+        """Data and random numbers of later times, for hooks."""
         data = self._root.child("data").value or {}
         lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
         keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
@@ -155,7 +155,7 @@ class ResolvedTask:
         return Quantities([quantity for quantity, _ in found.values()], read)
 
     def _makers(self) -> Iterator[tuple[Entry, Callable[[], Any]]]:
-        """What evaluates everything once, so that one error tells all mistakes."""
+        """Functions that evaluate everything once, so that one error tells all mistakes."""
         declared = self._declared
         for entry, expression, moment in self._plain_expressions():
             yield entry, partial(self._naming.value, entry, expression, moment)
@@ -175,7 +175,7 @@ class ResolvedTask:
             yield seen.entry, partial(self._in_form, seen)
 
     def _plain_expressions(self) -> Iterator[tuple[Entry, Expression, Moment]]:
-        """Expressions that are used as they are, where they stand, and when they are evaluated."""
+        """Expressions without a form of their own, their places, and the moments of evaluation."""
         for memory in self._declared.memory.values():
             if memory.update is not None:
                 yield memory.entry, memory.update, Moment.AFTER
@@ -226,7 +226,7 @@ class ResolvedTask:
         }
 
     def _variables(self) -> dict[str, Any]:
-        """All episode variables, and what they are at the beginning of an episode."""
+        """All episode variables with their start values."""
         memory = {name: one.start for name, one in self._declared.memory.items()}
         kept = {one.variable: np.zeros(one.length) for one in (*self._kept, *self._sensors)}
         switches: dict[str, float] = {}
@@ -271,10 +271,10 @@ class ResolvedTask:
         values = self._terms(rewards)
         return any(values[n].constant is None or rewards[n].weight != 1.0 for n in rewards)
 
-    # Spaces, and what leads into and out of them.
+    # Spaces, and conversions of their values.
 
-    def _hooks_of_spaces(self) -> dict[str, Hook]:
-        hooks: dict[str, Hook] = {}
+    def _hooks_of_spaces(self) -> dict[str, _Hook]:
+        hooks: dict[str, _Hook] = {}
         actions, seen, formulas = self._action_space(), self._observation_space(), self.formulas
         if formulas.inputs is not None:
             hooks["_get_action_space"] = lambda env: actions
@@ -283,10 +283,10 @@ class ResolvedTask:
         return hooks
 
     def _action_space(self) -> spaces.Space[Any] | None:
-        """The action space; None if it is that of the inputs as they are."""
+        """Action space; None for the space of the inputs."""
         variables = self._declared.actions
         are_inputs = all(
-            variable.in_fmu is not None and is_plain(variable) for variable in variables
+            variable.in_fmu is not None and has_fmu_values(variable) for variable in variables
         )
         if are_inputs and not self._declared.inputs and not self._declared.rescales:
             return None
@@ -325,7 +325,7 @@ class ResolvedTask:
         check_written(entry, variable, value, self._declared.memory)
         return value
 
-    def _action_masks(self) -> Hook | None:
+    def _action_masks(self) -> _Hook | None:
         naming, values = self._naming, list[Value]()
         for variable in self._declared.actions if self._declared.are_choices else ():
             for level in map(naming.constant, variable.levels):
@@ -339,19 +339,19 @@ class ResolvedTask:
         return lambda env: np.array(masks(env), dtype=np.bool_)
 
     def _observation_space(self) -> spaces.Space[Any] | None:
-        """The observation space; None if it is that of the outputs as they are."""
+        """Observation space; None for the space of the outputs."""
         names, variables = [seen.name for seen in self._seen], self._declared.variables
         if (
             self._declared.normalization is None
             and names == self._naming.outputs
-            and all(is_plain(variables[name]) for name in names)
+            and all(has_fmu_values(variables[name]) for name in names)
         ):
             return None
         return _box([seen.limits for seen in self._normalized])
 
     @cached_property
     def _normalized(self) -> list[Seen]:
-        """What the agent observes, in the form of its observations."""
+        """Normalized observed values, in the form of the observations."""
         return [self._in_form(seen) for seen in self._seen]
 
     def _in_form(self, seen: Seen) -> Seen:
@@ -362,7 +362,7 @@ class ResolvedTask:
                 return normalized(seen, self._declared.nominal_of(seen.name))
         return seen
 
-    # What follows a step.
+    # After a step.
 
     def _make_formulas(self) -> Formulas:
         declared = self._declared
@@ -385,7 +385,7 @@ class ResolvedTask:
             self._info() if has_info else {},
         )
 
-    def _hooks_of_rewards(self) -> dict[str, Hook]:
+    def _hooks_of_rewards(self) -> dict[str, _Hook]:
         rewards = self._declared.rewards
         if not rewards:
             return {}
@@ -393,11 +393,11 @@ class ResolvedTask:
         return {"_explain": explain, "_fault_reward": self._fault_reward()}
 
     def _updates_of_histories(self) -> list[Update]:
-        """The sensors follow what they measure."""
+        """Updates of histories and sensors; sensors come after the values that they measure."""
         return [remembered(self._naming, kept) for kept in (self._kept, self._sensors)]
 
     def _switched(self) -> dict[str, Value]:
-        """What the task remembers of actions with a least time on or off, by variables."""
+        """Memory of actions with a least time on or off, by variable."""
         values: dict[str, Value] = {}
         for variable in self._switched_actions:
             values |= zip(switch_names(variable), self._naming.switched(variable), strict=True)
@@ -408,7 +408,7 @@ class ResolvedTask:
         if not self._has_worst:
             return {}
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
-        return {WORST: minimum(self._naming.read("variables", WORST), reward)}
+        return {_WORST: minimum(self._naming.read("variables", _WORST), reward)}
 
     @cached_property
     def _updated_kpis(self) -> dict[str, Value]:
@@ -420,7 +420,7 @@ class ResolvedTask:
         }
 
     def _kpi_value(self, kpi: Kpi) -> Value:
-        """What a figure is made of in a step."""
+        """Value that a step adds to a figure."""
         moment = Moment.JUDGED if kpi.how is None else Moment.UPDATED
         names = self._term_values(moment) | (self._known_kpis() if kpi.how is None else {})
         return self._naming.value(kpi.entry, kpi.expression, moment, names).number
@@ -450,20 +450,20 @@ class ResolvedTask:
         return values
 
     def _updated_memory(self) -> dict[str, Value]:
-        """All values of the memory are computed before one of them is written."""
+        """New values of the memory; all are computed before one is written."""
         return {
             name: self._naming.value(memory.entry, memory.update, Moment.AFTER).number
             for name, memory in self._declared.memory.items()
             if memory.update is not None
         }
 
-    def _fault_reward(self) -> Hook:
+    def _fault_reward(self) -> _Hook:
         """A failed step gives the reward that the file says, or no more than any step before."""
         own = self._root.child("config").child("fault_reward")
         if own.value is not None:
             return lambda env: env.config.fault_reward
         if self._has_worst:
-            return lambda env: env.variables[WORST]
+            return lambda env: env.variables[_WORST]
         reward = function_of(_sum(self._terms(self._declared.rewards)))
         return lambda env: min(0.0, reward(env))
 

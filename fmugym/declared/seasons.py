@@ -1,4 +1,4 @@
-"""When in a year an episode begins: dates, seasons and scenarios."""
+"""Beginnings of episodes in the year: dates, seasons and scenarios."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 from fmugym.checks import Spellings
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import chosen_files, file_lists
-from fmugym.distributions import Choice, Column
+from fmugym.distributions import Choice, DrawnColumn
 from fmugym.errors import unknown_name
 
 __all__ = ["Scenario", "held_out_times", "read_begin", "read_scenarios"]
@@ -27,7 +27,7 @@ class Scenario(NamedTuple):
 
     Attributes:
         start: When it begins, in seconds since the beginning of the year.
-        length: How long it is, in seconds.
+        length: Length in seconds.
         files: The numbers of its files, by their episode variables; of others it has any.
     """
 
@@ -36,7 +36,7 @@ class Scenario(NamedTuple):
     files: Mapping[str, int] = MappingProxyType({})
 
     def start_after(self, warm_up: float) -> float:
-        """When an FMU has to begin so that the scenario follows its warm-up, at least 0."""
+        """Start time of an FMU before the scenario's warm-up, at least 0."""
         return self.start - warm_up if self.start >= warm_up else (self.start - warm_up) % _YEAR
 
     def overlaps(self, start: float, length: float, files: Mapping[str, int]) -> bool:
@@ -72,7 +72,7 @@ def read_begin(
 
     Args:
         entry: A time or date, a distribution of seconds, a list of times and dates, or a season.
-        scenarios: What a season may exclude.
+        scenarios: Scenarios that a season may exclude.
         length: The length of an episode in seconds; 0 if it has no limit.
         before: The length of a warm-up with the data of the time before the beginning.
         files: The numbers of files from which an episode draws one, by episode variable.
@@ -102,7 +102,7 @@ def read_begin(
         raise entry.error("no day of the season is left for an episode")
     if not named:
         return Choice([start for (start,) in free]), alone
-    begin, *columns = (Column(one, table="beginnings") for one in zip(*free, strict=True))
+    begin, *columns = (DrawnColumn(one, table="beginnings") for one in zip(*free, strict=True))
     drawn = dict(zip(named, columns, strict=True))
     return begin, drawn | {name: one for name, one in alone.items() if name not in named}
 
@@ -139,7 +139,7 @@ def _excluded(entry: Entry, scenarios: Mapping[str, Scenario]) -> list[Scenario]
 
 
 def held_out_times(root: Entry) -> list[Scenario]:
-    """When in a year a task has no episodes but those of its scenarios: in these, and off season.
+    """Times of the year without training episodes: scenarios, and days outside of the season.
 
     Args:
         root: The task outside of its scenarios.

@@ -10,11 +10,12 @@ from typing import Final
 import numpy as np
 
 from fmugym.declared.data_rows import read_rows
-from fmugym.declared.dates import DAY, YEAR, FloatArray
+from fmugym.declared.dates import DAY, YEAR
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import files_of, variable_of
-from fmugym.declared.parts import Limits, read_limits
+from fmugym.declared.section_entries import Limits, read_limits
 from fmugym.errors import ConfigError, shown
+from fmugym.pool.base import FloatArray
 from fmugym.task.future import Span, distance_of
 
 __all__ = ["Series", "read_data", "read_schedule"]
@@ -30,7 +31,7 @@ class Series:
     """A function of time that repeats itself.
 
     Attributes:
-        entry: Where it is declared.
+        entry: Entry of the task.
         start: The time in seconds of the first row.
         period: Seconds after which it repeats.
         times: Seconds since ``start``, rising.
@@ -38,7 +39,7 @@ class Series:
         is_stepped: Whether the values jump, and hold until the next one.
         limits: For the observation space.
         unit: The unit of the values; None if none is declared.
-        others: Those of the other files, if an episode draws one of several.
+        others: Series of the other files, if an episode draws one of several.
         variable: The episode variable with the number of the file; "" if there is only one.
     """
 
@@ -60,7 +61,7 @@ class Series:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Those of its files."""
+        """Spans of time that its files cover."""
         return tuple(Span(one.start, one.period) for one in self.files)
 
     @property
@@ -80,7 +81,7 @@ class Series:
         """Make a series of rows.
 
         Args:
-            entry: Where it is declared; ``min``, ``max`` and ``unit`` are read from it.
+            entry: Entry of the task; ``min``, ``max`` and ``unit`` are read from it.
             times: The times of the rows in seconds.
             values: Their values.
             period: Seconds after which the rows repeat.
@@ -121,7 +122,7 @@ def read_data(entry: Entry, standard: int | None = None) -> Series:
     """Read a column of a file or of each of several, or a list of values.
 
     Args:
-        entry: Where it is declared.
+        entry: Entry of the task.
         standard: The offset of the task's standard time in seconds east of UTC; None for the
             smallest offset of the rows.
 

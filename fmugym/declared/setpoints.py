@@ -1,4 +1,4 @@
-"""Set points: what a task wants a variable to be."""
+"""Set points: values to which a task wants to bring variables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import RAMP, SETPOINT, SINE, STEPS
-from fmugym.declared.parts import Derived, Limits, Memory, read_limits
+from fmugym.declared.section_entries import Derived, Limits, MemoryVariable, read_limits
 from fmugym.declared.series import Series, read_schedule
 from fmugym.expressions.language import Expression
 
@@ -31,7 +31,7 @@ class Steps:
     """A set point that jumps to a new random value now and then.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         limits: The values lie between these.
         every: Seconds from one value to the next.
         channel: Its number, from which its values follow.
@@ -44,7 +44,7 @@ class Steps:
 
 
 class Deviation(NamedTuple):
-    """How far something is from its set point.
+    """Deviation of a variable from its set point.
 
     Attributes:
         setpoint: The name of the set point.
@@ -63,12 +63,12 @@ class SetPoints:
         memory: Gets those that are constant or drawn, and the numbers of curves.
         series: Gets those that depend on the time of day.
         derived: Gets those that follow a curve or data, and the deviations.
-        steps: Those that jump.
-        deviations: What the names of deviations stand for.
+        steps: Set points that jump.
+        deviations: Deviations from set points, by name.
         brought: The names that curves and deviations bring with them.
     """
 
-    memory: dict[str, Memory]
+    memory: dict[str, MemoryVariable]
     series: dict[str, Series]
     derived: dict[str, Derived]
     steps: dict[str, Steps] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class SetPoints:
         match kind:
             case "value":
                 value = entry.required("value").value
-                self.memory[entry.name] = Memory(entry, value, None, read_limits(entry))
+                self.memory[entry.name] = MemoryVariable(entry, value, None, read_limits(entry))
             case "schedule":
                 self.series[entry.name] = read_schedule(entry)
             case "steps":
@@ -114,6 +114,6 @@ class SetPoints:
         names = {key: f"{entry.name}_{key}" for key in numbers}
         self.brought |= set(names.values())
         for key, one in numbers.items():
-            self.memory[names[key]] = Memory(entry, one.value, None, _UNLIMITED)
+            self.memory[names[key]] = MemoryVariable(entry, one.value, None, _UNLIMITED)
         expression = Expression.parse(formula.format(**names))
         self.derived[entry.name] = Derived(entry, expression, read_limits(entry))

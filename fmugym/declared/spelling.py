@@ -1,4 +1,4 @@
-"""The names of a task as they are declared, also where others stand that only look the same."""
+"""Spelling of names: characters that only look the same are replaced by the declared ones."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def as_declared(root: Entry, description: ModelDescription) -> tuple[Entry, Name
 
     Args:
         root: The table of all keys.
-        description: That of the FMU.
+        description: Description of the FMU.
 
     Returns:
         The table, and the function that brings names into this form.
@@ -60,7 +60,7 @@ def as_declared(root: Entry, description: ModelDescription) -> tuple[Entry, Name
 
 
 def _declared_in(values: Mapping[str, Any]) -> Any:
-    """The names that a task declares, with those that set points bring with them."""
+    """Names that a task declares, with the names that set points add."""
     for section in (*_DECLARING, *_TERMS):
         given = values.get(section)
         yield from given if isinstance(given, Mapping) else ()

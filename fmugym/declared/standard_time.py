@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
-from fmugym.declared.data_rows import offsets_of
+from fmugym.declared.data_rows import utc_offsets_of
 from fmugym.declared.dates import HOUR, offset_text, standard_offset
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import files_of
@@ -20,7 +20,7 @@ class StandardTime(NamedTuple):
 
     Attributes:
         offset: Its offset in seconds east of UTC; None if nothing tells it.
-        origin: What tells it.
+        origin: Source of the offset.
     """
 
     offset: int | None
@@ -69,10 +69,10 @@ def _data(root: Entry) -> Iterator[Entry]:
 
 
 def _told(data: Iterable[Entry]) -> Iterator[tuple[str, int | None, tuple[int, ...]]]:
-    """What files tell; whoever reads their data says what is wrong with them."""
+    """Offsets that files tell; mistakes are reported by the reader of their data."""
     for entry in data:
         with suppress(ConfigError):
-            yield offsets_of(entry)
+            yield utc_offsets_of(entry)
 
 
 def _agreed(key: Entry, offsets: Sequence[tuple[str, int]], origin: str) -> StandardTime:

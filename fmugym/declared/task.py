@@ -1,4 +1,4 @@
-"""A task as a file or a dict declares it: read, merged with what it extends, and written."""
+"""A task as it is declared in a file or a dict: read, merged with the task it extends, written."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from fmugym.declared.seasons import read_scenarios
 from fmugym.declared.writing import as_toml, revised, write_new
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
-from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
+from fmugym.keys import Entries, Mistake, checked_entry, found_mistakes, with_paths
 
 __all__ = ["Task"]
 
@@ -45,13 +45,13 @@ _TOO_LONG: Final = {
     rf"(?:^|[\[{{,])[ \t]*+{_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{_DEEPEST}}}": _TOO_DEEP,
     r"(?<![\w.])[+-]?(?:\d_?+){1000}": "a number has 1000 digits at most",
 }
-"""What no task file needs, as patterns, and what to say of it."""
+"""Patterns of texts that no task file needs, with the messages about them."""
 
 _IN_A_KEY: Final = (
     "(?:Invalid statement|Invalid initial character for a key part|Expected '=' after a key|"
     "Expected ']' at the end of a table)"
 )
-"""What the parser of TOML says of a key in letters that only keys in quotes may have."""
+"""Message of the TOML parser about a letter that only keys in quotes may have."""
 
 _BARE_KEY: Final = r"""[^\s=.,\[\]{}"'\\#]+"""
 _MOST_PARSED: Final = 10**7
@@ -65,7 +65,7 @@ class Task:
     Two tasks are equal if they declare the same. Paths count as absolute paths.
 
     Attributes:
-        document: What it declares: dicts, lists, texts and numbers. Only a task that was made of a
+        document: Declarations: dicts, lists, texts and numbers. Only a task that was made of a
             dict may hold other objects.
         sources: The files that it was read from, the file itself first, or the dict.
         is_physical: Whether it is in its physical form; no file says so. See ``physical``.
@@ -95,7 +95,7 @@ class Task:
 
     @classmethod
     def draft(cls, config: Any) -> Task:
-        """Do what ``of`` does, but leave mistakes in values to ``root`` or ``begun``.
+        """Make a task as ``of`` does, but leave mistakes in values to ``root`` or ``begun``.
 
         Raises:
             ConfigError: If a file is missing, no TOML, or has an unknown version.
@@ -136,7 +136,7 @@ class Task:
 
         Args:
             document: The dict. Distributions may also be objects such as ``Uniform(0, 1)``.
-            folder: Where relative paths start; by default the working directory.
+            folder: Base of relative paths; by default the working directory.
 
         Raises:
             ConfigError: For an unknown key, or as ``read`` for a file that it extends.
@@ -204,7 +204,7 @@ class Task:
         return replace(self, is_physical=True)
 
     def in_scenario(self, name: str) -> Task:
-        """Return the task in one of its scenarios: its beginning and its length are given.
+        """Return the task in one of its scenarios, with a given beginning and length.
 
         In a task with a start time and no clock, the FMU begins so early that the scenario follows
         the warm-up.
@@ -238,7 +238,7 @@ class Task:
         return "task" if path is None else path.name
 
     def with_paths(self, path_of: Callable[[str], str]) -> dict[str, Any]:
-        """Return what the task declares, with other paths of its files.
+        """Return the declarations with other paths of files.
 
         Args:
             path_of: Takes the absolute path of the FMU or of a file of data, and returns the new
@@ -356,7 +356,7 @@ def _with_quoted_key(text: str, error: str) -> str | None:
 
 
 def _hint_of(text: str, error: str) -> str:
-    """What is missing where the parser of TOML stumbles: quotation marks, mostly."""
+    """Guess the mistake at which the parser of TOML fails, usually missing quotation marks."""
     if re.search("Invalid value|Expected newline", error):
         return "; texts and expressions stand in quotes"
     line = re.search(r"at line (\d+)", error)
@@ -389,16 +389,16 @@ def _advice(path: Path) -> str:
 
 
 def _check(source: Source) -> None:
-    """Check what is not merged: the version, and what is extended."""
+    """Check the keys that are not merged: the version, and the extended task."""
     for name in _NOT_INHERITED:
         entry = _root(source).child(name)
         if entry.value is not None:
             with entry.placing():
-                checked(Entries(TASK.keys[name].kind), {name: entry.value})
+                checked_entry(Entries(TASK.keys[name].kind), {name: entry.value})
 
 
 def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace values by those of the same keys; tables are merged, but not what they describe."""
+    """Replace values of the same keys, and merge tables, but not the tables of one value."""
     merged = dict(base)
     for key, value in own.items():
         before = merged.get(key)
@@ -435,7 +435,7 @@ def _plain(value: Any) -> Any:
 
 
 def _named(value: type) -> Any:
-    """``"module:Class"`` where it leads to the class, the class itself otherwise."""
+    """Name a class by ``"module:Class"`` if that leads to it; otherwise the class itself."""
     with suppress(KeyError, AttributeError):
         if getattr(sys.modules[value.__module__], value.__qualname__) is value:
             return f"{value.__module__}:{value.__qualname__}"

@@ -32,15 +32,15 @@ class TaskEnv(FMUEnv):
         render_mode: As for ``FMUEnv``.
         backend: As for ``FMUEnv``.
         isolation: As for ``FMUEnv``.
-        master: Of a system: ``"gauss_seidel"`` or ``"jacobi"``, in the place of what its SSP
-            archive or the task says.
+        master: Master algorithm of a system, ``"gauss_seidel"`` or ``"jacobi"``, in the place of
+            the one of its SSP archive or of the task.
 
     Attributes:
         task: The task.
-        cost_limits: What the costs of an episode may add up to, by name, as the task says.
+        cost_limits: Limits of the costs of an episode, by name, as the task says.
         unphysical_keys: The keys of the task for which observations or actions are not in its
             units; none in its physical form, which controllers need, see ``Task.physical``.
-        expressions: Those of the task, of rewards and costs among others, as they are parsed.
+        expressions: Expressions of the task, of rewards and costs among others, as they are parsed.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the

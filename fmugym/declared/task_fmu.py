@@ -15,7 +15,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.declared.entries import Entry
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, TaskError, missing_file
-from fmugym.keys import table_of
+from fmugym.keys import table_of_fields
 from fmugym.systems import Component, FMUSystem
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
@@ -31,7 +31,7 @@ def described(root: Entry, master: str | None = None) -> tuple[Path | FMUSystem,
 
     Args:
         root: The table of all keys of the task.
-        master: Of a system, in the place of what its archive or the task says.
+        master: Master algorithm of a system, in the place of the one of its archive or of the task.
 
     Raises:
         ConfigError: If there is none; the text tells all mistakes that are known then.
@@ -55,7 +55,7 @@ def fmu_of(task: Task, master: str | None = None) -> Path | FMUSystem:
 
     Args:
         task: The task.
-        master: Of a system, in the place of what the archive or the file says.
+        master: Master algorithm of a system, in the place of the one in the archive or the file.
 
     Raises:
         ConfigError: If the task names none, or there is no bundled FMU of this name.
@@ -88,7 +88,7 @@ def _fmu_or_archive(entry: Entry, master: str | None) -> Path | FMUSystem:
 
 @contextmanager
 def _placing_load(entry: Entry) -> Iterator[None]:
-    """Let errors of a file say where the task names it."""
+    """Add the place of a file in the task to errors about the file."""
     try:
         yield
     except FMULoadError as error:
@@ -139,7 +139,7 @@ def _system(section: Entry, master: str | None) -> FMUSystem:
 
 
 def _sound_part(section: Entry, options: dict[str, Any]) -> FMUSystem:
-    """Note what is wrong in a system, and make it of the rest."""
+    """Note the mistakes of a system, and make a system of its sound part."""
     sound = {**options, "components": {}, "connections": [], "units": {}}
     for name, component in options["components"].items():
         for given in (replace(component, start_values={}), component):
@@ -166,12 +166,15 @@ def _sound_part(section: Entry, options: dict[str, Any]) -> FMUSystem:
 
 _MOST_KNOWN: Final = 16
 _known: Final[dict[Any, FMUSystem]] = {}
-"""Systems by what declares them and the state of their FMUs: environments of a task share one."""
+"""Systems by their declarations and the state of their FMUs, shared by the environments of a
+task."""
 
 
 def _component(entry: Entry) -> tuple[Component, _State]:
     fmu = entry if entry.child("fmu").value is None else entry.child("fmu")
-    own = {name: entry.value[name] for name in table_of(Component).keys if name in entry.value}
+    own = {
+        name: entry.value[name] for name in table_of_fields(Component).keys if name in entry.value
+    }
     state = _state(fmu, _path(fmu))
     with entry.placing():
         return Component(**{**own, "fmu": state[0]}), state
@@ -203,7 +206,7 @@ def _resized(description: ModelDescription, parameters: Entry) -> ModelDescripti
 
 
 _State = tuple[Path, int, int]
-"""A file, and what changes with its content."""
+"""A file, and its time of change and size, which change with the content."""
 
 
 def _state(entry: Entry, path: Path) -> _State:

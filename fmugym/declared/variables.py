@@ -16,7 +16,7 @@ from fmugym.checks import Spellings, normal_form
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
 from fmugym.declared.numbers import number_or_distribution
-from fmugym.declared.parts import Limits, read_limits
+from fmugym.declared.section_entries import Limits, read_limits
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
 from fmugym.task.ranges import within
@@ -27,8 +27,8 @@ __all__ = [
     "NAMING",
     "TaskVariable",
     "TaskVariables",
-    "is_plain",
-    "start_value",
+    "declared_start",
+    "has_fmu_values",
 ]
 
 _PLAIN: Final = ("levels", "delta", "min_on", "min_off")
@@ -44,12 +44,12 @@ class TaskVariable:
 
     Attributes:
         alias: Its name in the task.
-        entry: Where it is declared or used first.
+        entry: Entry that declares or first uses the variable.
         in_fmu: The FMU's variable, with the bounds and the sampling of the task; None for an
             action that only expressions read.
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
-        limits: Those in the unit of the task; infinite where there are none.
+        limits: Limits in the unit of the task; infinite where there are none.
         nominal: The usual size of its values; None if neither the task nor the FMU says it.
         levels: The values that an action chooses from; empty for a continuous one.
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
@@ -188,9 +188,9 @@ class TaskVariables:
         """The variable of a name.
 
         Args:
-            entry: Where the name stands.
+            entry: Entry of the task.
             name: The name.
-            role: What it should name, for the error.
+            role: Role of the variable, for the error.
             others: More names to suggest.
 
         Raises:
@@ -204,7 +204,7 @@ class TaskVariables:
         return variable
 
     def _dotted(self, name: str, value: object) -> str:
-        """Say what TOML makes of a name with dots, if that explains an unknown name."""
+        """Explain that TOML reads a name with dots as tables, if that explains an unknown name."""
         while isinstance(value, Mapping) and value:
             key = next(iter(value))
             name, value = f"{name}.{key}", value[key]
@@ -326,7 +326,7 @@ def _with_unit(alias: str, entry: Entry, description: ModelDescription) -> Varia
 
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> Limits:
-    """The limits of the task, or else those of the FMU."""
+    """Limits of the task, or else of the FMU."""
     own = (-math.inf, math.inf) if variable is None else variable.extremes
     low, high = read_limits(entry, *sorted(map(conversion, own)))
     if entry.value and not low < high and entry.value.keys() & {"min", "max"}:
@@ -340,13 +340,13 @@ def _own_nominal(variable: Variable | None, conversion: Conversion) -> float | N
     return None if not own or conversion.offset else abs(own * conversion.factor)
 
 
-def is_plain(variable: TaskVariable) -> bool:
-    """Whether the values of the task are those of the FMU."""
+def has_fmu_values(variable: TaskVariable) -> bool:
+    """Whether the task gives the values to the FMU without a change."""
     is_same = variable.conversion == IDENTITY and not variable.levels
     return is_same and variable.is_direct
 
 
-def start_value(variable: TaskVariable, entry: Entry) -> Any:
+def declared_start(variable: TaskVariable, entry: Entry) -> Any:
     """The value of a parameter: a number or distribution in the unit of the FMU, or a text.
 
     Raises:

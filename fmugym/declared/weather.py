@@ -1,4 +1,4 @@
-"""Weather of EnergyPlus (EPW files), and the tables of Modelica, which may be such weather.
+"""Weather of EnergyPlus (EPW files), and tables of Modelica, which may contain such weather.
 
 Sources: EnergyPlus, Auxiliary Programs, "EnergyPlus Weather File (EPW) Data Dictionary", for the
 fields, their order, their codes for missing values, and what is a mean of the time before;
@@ -19,9 +19,10 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.declared.data_tables import Column, Table
-from fmugym.declared.dates import DAY, HOUR, YEAR, FloatArray
-from fmugym.errors import ConfigError, reading, shown
+from fmugym.declared.data_tables import DataColumn, DataTable
+from fmugym.declared.dates import DAY, HOUR, YEAR
+from fmugym.errors import ConfigError, reading_file, shown
+from fmugym.pool.base import FloatArray
 
 __all__ = ["read_modelica", "read_weather"]
 
@@ -69,7 +70,7 @@ _CODES_OF_TABLES: Final = {**_CODES, "Wind Direction": math.inf}
 """The same in tables, which count turns of the wind beyond 360 degrees."""
 
 _MEANS: Final = ("Radiation", "Illuminance", "Luminance")
-"""How the names of fields end that are means of the time since the row before."""
+"""Ends of the names of fields whose values are means since the row before."""
 
 _PLACE_OF_OFFSET: Final = 8
 """The cell of the line of the place with the hours from UTC."""
@@ -83,7 +84,7 @@ _TABLE: Final = re.compile(
 )
 
 
-def read_weather(name: str, lines: Sequence[str]) -> Table:
+def read_weather(name: str, lines: Sequence[str]) -> DataTable:
     """Read weather of EnergyPlus.
 
     Times are those of the file: local standard time, from the beginning of a year of 365 days. The
@@ -91,13 +92,13 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
     January of the next year.
 
     Args:
-        name: What the file is called.
+        name: Name of the file.
         lines: Its lines.
 
     Raises:
         ConfigError: If they are no such weather.
     """
-    with reading(f"{name} is no weather of EnergyPlus"):
+    with reading_file(f"{name} is no weather of EnergyPlus"):
         per_hour, fields = _fields(name, "\n".join(lines))
         dates = zip(*(fields[key].numbers.tolist() for key in _DATES[1:4]), strict=True)
         times = np.array(
@@ -107,8 +108,8 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
         return _weather([*fields.values()], times, _CODES, lines)
 
 
-def _fields(name: str, text: str) -> tuple[int, dict[str, Column]]:
-    """How many records there are in an hour, and the fields of those not of 29 February."""
+def _fields(name: str, text: str) -> tuple[int, dict[str, DataColumn]]:
+    """Number of records in an hour, and fields of all records but those of 29 February."""
     head = _PERIODS.search(text)
     above = text.count("\n", 0, head.end()) + 1 if head else 0
     lines = enumerate(text.split("\n")[above:] if head else [], above + 1)
@@ -120,7 +121,7 @@ def _fields(name: str, text: str) -> tuple[int, dict[str, Column]]:
         )
     kept = {n: one for n, one in records.items() if not _is_leap_day(one)}
     columns = zip((*_DATES, *_CODES), zip(*kept.values(), strict=True), strict=False)
-    fields = {key: Column(name, key, cells, [*kept]) for key, cells in columns}
+    fields = {key: DataColumn(name, key, cells, [*kept]) for key, cells in columns}
     flags = _DATES[-1]
     return int(head[1]), fields | {flags: replace(fields[flags], cells=np.full(len(kept), np.nan))}
 
@@ -140,7 +141,7 @@ def _offset(lines: Sequence[str]) -> int | None:
 
 
 def _end_of(date: Sequence[float], part: int, parts: int) -> float:
-    """When a record ends. Hour 1 is the first of a day; minutes mean several things in practice."""
+    """End of a record. Hour 1 is the first of a day; minutes mean several things in practice."""
     month, day, hour = map(int, date)
     if not 1 <= hour <= 24:
         raise ValueError(f"expected hours from 1 to 24, got {hour}")
@@ -149,13 +150,16 @@ def _end_of(date: Sequence[float], part: int, parts: int) -> float:
 
 
 def _weather(
-    fields: Sequence[Column], times: FloatArray, codes: Mapping[str, float], lines: Sequence[str]
-) -> Table:
+    fields: Sequence[DataColumn],
+    times: FloatArray,
+    codes: Mapping[str, float],
+    lines: Sequence[str],
+) -> DataTable:
     """Weather of fields. It lasts whole days, with a row for its first midnight or not."""
     fields = [one for one in fields if one.name != "time"]
     columns = [_without(one, codes.get(one.name, math.inf)) for one in fields]
     time = replace(fields[0], name="time", cells=times, of_year=True)
-    return Table(
+    return DataTable(
         [*columns, time] if _DATES[0] in fields[0].name else [time, *columns],
         period=math.ceil((times[-1] - times[0]) / DAY) * DAY,
         means={one.name: float(np.diff(times[:2]).sum()) for one in columns if _is_mean(one)},
@@ -164,16 +168,16 @@ def _weather(
     )
 
 
-def _without(field: Column, code: float) -> Column:
+def _without(field: DataColumn, code: float) -> DataColumn:
     """A field without the values that say that one is missing."""
     return replace(field, cells=np.where(field.numbers < code, field.numbers, np.nan))
 
 
-def _is_mean(field: Column) -> bool:
+def _is_mean(field: DataColumn) -> bool:
     return field.name.endswith(_MEANS)
 
 
-def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
+def read_modelica(name: str, lines: Sequence[str]) -> dict[str, DataTable]:
     """Read the tables of a text file of Modelica, by name.
 
     Columns are called ``"time"``, ``"2"``, ``"3"`` and so on, or like the fields of weather, if
@@ -181,7 +185,7 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
     ``CombiTimeTable``: its last row is at the time of the first one of the next period.
 
     Args:
-        name: What the file is called.
+        name: Name of the file.
         lines: Its lines; the first one is ``#1``.
 
     Raises:
@@ -199,14 +203,14 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
     }
 
 
-def _modelica_table(what: str, rows: int, width: int, text: str, head: Sequence[str]) -> Table:
+def _modelica_table(what: str, rows: int, width: int, text: str, head: Sequence[str]) -> DataTable:
     cells = text.translate(str.maketrans(",;", "  ")).split()
     if len(cells) != rows * width:
         raise ConfigError(f"{what} has {len(cells)} numbers, expected a shape of ({rows}, {width})")
     is_weather = bool(head) and width == 1 + len(_CODES)
     names = ("time", *_CODES) if is_weather else ("time", *map(str, range(2, width + 1)))
     numbers = range(1, rows + 1)
-    columns = [Column(what, name, cells[i::width], numbers) for i, name in enumerate(names)]
+    columns = [DataColumn(what, name, cells[i::width], numbers) for i, name in enumerate(names)]
     times, *_ = [column.numbers for column in columns]
     period = float(times[-1] - times[0])
     is_left = np.append(np.diff(times) == 0, True)  # the first row comes again after the last one
@@ -214,4 +218,4 @@ def _modelica_table(what: str, rows: int, width: int, text: str, head: Sequence[
     if is_weather:
         return _weather(columns, times, _CODES_OF_TABLES, head)
     columns[0] = replace(columns[0], cells=times)
-    return Table(columns, period=period or DAY, offset=_offset(head))
+    return DataTable(columns, period=period or DAY, offset=_offset(head))

@@ -13,7 +13,7 @@ from fmugym.files import write_whole
 
 __all__ = ["as_toml", "revised", "write_new"]
 
-Keys = tuple[str, ...]
+_Keys = tuple[str, ...]
 
 _INLINE: Final = ("fmu", "clock", "warm_up")
 """Tables that describe one value; they are written in one line."""
@@ -54,8 +54,8 @@ def as_toml(document: Mapping[str, Any]) -> str:
     return str(tomlkit.dumps(written))
 
 
-def _table(items: Mapping[str, Any], keys: Keys) -> Any:
-    """A table with a heading; those within it that have one come last."""
+def _table(items: Mapping[str, Any], keys: _Keys) -> Any:
+    """Write a table with a heading; inner tables with headings come last."""
     import tomlkit
 
     table, last = tomlkit.table(), {}
@@ -94,7 +94,7 @@ def revised(text: str, document: Mapping[str, Any]) -> str | None:
         return None
 
 
-def _revise(table: MutableMapping[str, Any], wanted: Mapping[str, Any], keys: Keys) -> None:
+def _revise(table: MutableMapping[str, Any], wanted: Mapping[str, Any], keys: _Keys) -> None:
     for key in [key for key in table if key not in wanted]:
         del table[key]
     for key, value in wanted.items():
@@ -105,11 +105,11 @@ def _revise(table: MutableMapping[str, Any], wanted: Mapping[str, Any], keys: Ke
             table[key] = _new(value, (*keys, key))
 
 
-def _new(value: Any, keys: Keys) -> Any:
+def _new(value: Any, keys: _Keys) -> Any:
     return _table(value, keys) if _has_heading(value, keys) else _item(value, keys)
 
 
-def _has_heading(value: Any, keys: Keys) -> bool:
+def _has_heading(value: Any, keys: _Keys) -> bool:
     """Whether a value is a table with a heading."""
     return isinstance(value, Mapping) and len(keys) == 1 and keys[0] not in _INLINE
 
@@ -123,7 +123,7 @@ def _same(first: Any, second: Any) -> bool:
     return bool(isinstance(first, bool) == isinstance(second, bool) and first == second)
 
 
-def _item(value: Any, keys: Keys) -> Any:
+def _item(value: Any, keys: _Keys) -> Any:
     import tomlkit
 
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Cells of the CloudPendulum lab as backends.
+"""Cells of the CloudPendulum lab, as backends.
 
 They use the methods of the published client only. So the client of the real lab fits as well as
 that of the simulated lab, and neither is imported here.
@@ -19,7 +19,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool import Paced
 from fmugym.pool.backend.clocks import RealClock
 
-__all__ = ["Cell", "Lease", "paced_cells"]
+__all__ = ["CellBackend", "Lease", "paced_cells"]
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ _METHODS: Final = (
     "set_torque",
     "set_impedance_controller_params",
 )
-"""The methods that every client has; those for leases are needed for leases only."""
+"""Methods of every client; methods about leases are needed for leases only."""
 
 _LEAVING = re.compile("(Position|Velocity) ?Limit ?Violation")
 """The lab's message that it has ended a session because the arm passed a limit."""
@@ -107,12 +107,12 @@ class Lease:
     def __post_init__(self) -> None:
         self._is_own = self.gym_token is None
 
-    def __call__(self, count: int) -> list[Cell]:
+    def __call__(self, count: int) -> list[CellBackend]:
         """Make backends for a number of cells."""
         self._count = count
         if count > 1 and self.gym_time is None:
             self.gym_time = _DEFAULT_GYM_TIME
-        return [Cell(self, _like(self.client)) for _ in range(count)]
+        return [CellBackend(self, _like(self.client)) for _ in range(count)]
 
     def open(self) -> None:
         """Make the lease if one is needed and there is none."""
@@ -135,7 +135,7 @@ class Lease:
         return token, is_leased
 
 
-class Cell:
+class CellBackend:
     """A cell as a backend: it reads position and velocity at the tick, then sets the torque.
 
     See ``Backend``.

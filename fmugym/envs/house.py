@@ -27,7 +27,7 @@ class HouseEnv(TaskEnv):
     Args:
         scenario: "autumn", "frost" or "spring": two weeks that training leaves out. By default an
             episode begins on a day that is drawn from the others.
-        fmi_version: Of the FMU, "2.0" or "3.0".
+        fmi_version: FMI version of the FMU, "2.0" or "3.0".
         log_level: As for ``TaskEnv``.
         render_mode: As for ``TaskEnv``.
         options: More arguments of ``TaskEnv``.

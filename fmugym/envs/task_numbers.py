@@ -38,7 +38,7 @@ def with_task_numbers(
     """Tell the numbers of a task from the parameters of its FMU.
 
     Args:
-        numbers: Those of the task by name, with their defaults.
+        numbers: Numbers of the task by name, with their defaults.
         given: Values or distributions that the user gives, of both.
 
     Returns:

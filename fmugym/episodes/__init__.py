@@ -1,1 +1,1 @@
-"""Episodes of a task: who acts, what comes of it, and files about it."""
+"""Episodes of a task: players, scores, and files."""

@@ -1,4 +1,4 @@
-"""Agents and simple controllers side by side: the same episodes, and what each makes of them."""
+"""Evaluation of players: all play the same episodes, with a score for each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import most_steps_of
+from fmugym.baselines.candidate_evaluation import most_steps_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.episodes.simulation import Player, Policy, Summary, simulate
@@ -49,7 +49,7 @@ Wrap = Callable[[FMUEnv], Any]
 
 @dataclass(frozen=True)
 class Score:
-    """What a controller reached in some episodes.
+    """Result of a player in some episodes.
 
     Attributes:
         name: The controller.
@@ -115,7 +115,7 @@ def evaluate(
 
     Args:
         make_env: A function that makes the environment; see ``Player.make_env``.
-        players: Who acts, by name.
+        players: Players by name.
         seeds: The seeds of the episodes.
         most_steps: The steps after which an episode is stopped.
         scenario: The scenario that the environment plays, for the scores.
@@ -212,7 +212,7 @@ def warning_of_one_reward(scores: Sequence[Score]) -> str | None:
     """Say that a reward has never changed, so that there may be nothing to learn.
 
     Args:
-        scores: Those of one evaluation.
+        scores: Scores of one evaluation.
 
     Returns:
         A line of text; None if rewards differ, or so do the lengths of episodes with rewards.

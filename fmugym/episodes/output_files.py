@@ -1,4 +1,4 @@
-"""What ``fmugym simulate`` writes: tables, pictures, reports."""
+"""Output files of ``fmugym simulate``: tables, pictures, reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.series import RecordSeries, TimeSeries, plot, write_report
 
-__all__ = ["About", "Recording", "require_format", "require_picture", "title_of"]
+__all__ = ["About", "EpisodeFiles", "require_format", "require_picture", "title_of"]
 
 _TABLES: Final = (".csv", ".parquet")
 _PICTURES: Final = (".png", ".svg", ".pdf")
@@ -47,18 +47,18 @@ def _require_ending(path: Path, endings: Sequence[str]) -> None:
 
 
 def title_of(target: str) -> str:
-    """What a task is called in pictures and reports: a file by its name, without its folder."""
+    """Title of a task in pictures and reports: a file's name without its folder."""
     path = Path(target)
     return path.name if path.is_file() else target
 
 
 @dataclass(frozen=True)
 class About:
-    """What a report tells of a task.
+    """Description of a task in a report.
 
     Attributes:
         facts: By name: the FMU, versions.
-        description: What the task is about.
+        description: Description of the task.
         text: The task, as its file has it.
     """
 
@@ -81,7 +81,7 @@ class About:
         return cls(facts, str(task.document.get("description", "")), text)
 
 
-class Recording:
+class EpisodeFiles:
     """The episodes of one controller after another, and the files about them.
 
     Args:
@@ -109,7 +109,7 @@ class Recording:
 
     @contextmanager
     def finished(self, seed: int) -> Iterator[None]:
-        """Write all files at the end, however that comes, with what was recorded until then."""
+        """Write all files at the end, also after a failure, with the rows until then."""
         try:
             yield
         finally:

@@ -9,16 +9,16 @@ from contextvars import ContextVar
 from importlib import import_module
 from typing import Final
 
-__all__ = ["Advance", "no_progress", "progress", "quiet"]
+__all__ = ["Advance", "no_progress", "progress_bar", "quiet"]
 
 Advance = Callable[..., None]
-"""Is told how many steps were done since the last call, and perhaps a text to show beside."""
+"""Takes the number of steps since the last call, and perhaps a text to show beside."""
 
 
 _PARTS: Final = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"
 
 _FINE: Final = 1000
-"""So many parts of a bar are told apart where nothing is counted."""
+"""Resolution of a bar in which nothing is counted."""
 
 quiet: Final = ContextVar("quiet", default=False)
 """Whether to show results and errors only."""
@@ -34,13 +34,13 @@ def _is_watched() -> bool:
 
 
 @contextmanager
-def progress(total: float | None, what: str, unit: str = "steps") -> Iterator[Advance]:
+def progress_bar(total: float | None, what: str, unit: str = "steps") -> Iterator[Advance]:
     """Show a bar and the time left, in a terminal or a notebook, if tqdm is installed (``sb3``).
 
     Args:
         total: The number of steps; None if it is not known.
         what: A word for what is done.
-        unit: What is counted; "" if only parts are shown.
+        unit: Name of the counted things; "" if only parts are shown.
     """
     if quiet.get() or not _is_watched():
         yield no_progress

@@ -1,4 +1,4 @@
-"""Episodes of a task, and who acts in them."""
+"""Players of episodes: agents, controllers and random actions."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class Player:
-    """One who acts.
+    """Player of episodes: a policy, and the environment that it needs.
 
     Attributes:
         make_policy: Makes the policy for an environment.
@@ -72,7 +72,7 @@ class Summary:
 
     Attributes:
         seed: The seed of the episode.
-        steps: How many steps it had.
+        steps: Number of its steps.
         seconds: The simulated time.
         total_reward, total_cost: Sums over the episode; no cost if the task has none.
         end: ``"terminated"``, ``"truncated"``, or ``"fault: ..."`` with its reason.
@@ -199,7 +199,7 @@ def simulate(
     Args:
         env: An ``FMUEnv``, or a wrapper around one.
         policy: Chooses the actions.
-        seed: Of the episode, and of random actions.
+        seed: Seed of the episode, and of random actions.
         most_steps: The steps after which to stop. A registered id may have a lower limit, which
             truncates the episode.
         advance: Is told of each step.

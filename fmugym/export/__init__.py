@@ -5,14 +5,14 @@ and ``write_onnx`` write it. See ``docs/deploy.md``.
 """
 
 from fmugym.export.c99 import write_c
-from fmugym.export.exportable import Agent, agent_of
+from fmugym.export.exportable import ExportedAgent, agent_of
 from fmugym.export.fmus import write_fmu
 from fmugym.export.network import Activation, Layer, Network, Scaling, network_of
 from fmugym.export.onnx_model import write_onnx
 
 __all__ = [
     "Activation",
-    "Agent",
+    "ExportedAgent",
     "Layer",
     "Network",
     "Scaling",

@@ -51,7 +51,7 @@ def compiled(folder: Path, files: list[str], name: str, where: str) -> bytes:
     """Compile C sources to a shared library.
 
     Args:
-        folder: Where the sources are.
+        folder: Folder of the sources.
         files: Their names.
         name: The name of the library, without its extension.
         where: One of ``PLATFORMS``.

@@ -13,10 +13,10 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_path
-from fmugym.export.exportable import Agent
+from fmugym.export.exportable import ExportedAgent
 from fmugym.export.layers import array, bare, c_type, network_lines
 from fmugym.export.names import identifiers, new_file
-from fmugym.export.operations import HELPERS, TYPES, constant, expression
+from fmugym.export.operations import C_TYPES, HELPERS, constant, expression
 from fmugym.expressions.graph import Node
 
 __all__ = ["field_names", "header", "source", "write_c"]
@@ -65,7 +65,7 @@ int {name}_step({name}_state *state, const double *measurements, double *actions
 """
 
 
-def header(agent: Agent) -> str:
+def header(agent: ExportedAgent) -> str:
     """The header of an agent."""
     name, upper, logic = agent.name, agent.name.upper(), agent.logic
     return _HEADER.format(
@@ -79,7 +79,7 @@ def header(agent: Agent) -> str:
     )
 
 
-def _comment(agent: Agent) -> list[str]:
+def _comment(agent: ExportedAgent) -> list[str]:
     lines = [f"The agent {agent.name!r}, exported by fmugym {agent.version}.", *agent.notes]
     first, *others = map(_safe, lines)
     return [f"/* {first}", *(f" * {line}".rstrip() for line in others), " */"]
@@ -104,20 +104,20 @@ def _unit(variable: Variable) -> str:
     return f" /* {_safe(told)} */" if told else ""
 
 
-def field_names(agent: Agent) -> list[str]:
+def field_names(agent: ExportedAgent) -> list[str]:
     """The names of the fields of the state after ``count``."""
     taken = ["measurements", "actions"]  # of ONNX models
     return identifiers([*taken, *(kept.name for kept in agent.logic.kept)])[len(taken) :]
 
 
-def _fields(agent: Agent) -> Iterator[str]:
+def _fields(agent: ExportedAgent) -> Iterator[str]:
     settable = {agent.logic.kept[one.field].name for one in agent.logic.parameters}
     for name, kept in zip(field_names(agent), agent.logic.kept, strict=True):
         told = " /* a parameter: set it after the beginning */" if kept.name in settable else ""
         yield f"    {c_type(kept.dtype)} {name}[{len(kept.starts)}];{told}"
 
 
-def source(agent: Agent) -> str:
+def source(agent: ExportedAgent) -> str:
     """The source of an agent."""
     return _Source(agent).text()
 
@@ -125,7 +125,7 @@ def source(agent: Agent) -> str:
 class _Source:
     """Writes the source file of an agent."""
 
-    def __init__(self, agent: Agent) -> None:
+    def __init__(self, agent: ExportedAgent) -> None:
         self._agent, self._logic, self._name = agent, agent.logic, agent.name
         self._graph = agent.logic.graph
         self._helpers: dict[tuple[str, str], str] = {}
@@ -168,7 +168,7 @@ class _Source:
         return self._helpers.setdefault((helper, letter), f"{self._name}_{helper}{suffix}")
 
     def _evaluated(self, numbers: Iterable[int]) -> Iterator[str]:
-        """The lines that compute some nodes, and those that they need."""
+        """Write the lines that compute some nodes, with the nodes that these need."""
         needed = set(self._graph.needed(numbers, self._logic.loads))
         for number in sorted(needed - self._texts.keys()):
             node = self._graph.nodes[number]
@@ -260,7 +260,7 @@ class _Source:
 
     def _helper_lines(self) -> Iterator[str]:
         for (helper, letter), name in self._helpers.items():
-            yield "static " + HELPERS[helper].format(T=TYPES[letter], name=name)
+            yield "static " + HELPERS[helper].format(T=C_TYPES[letter], name=name)
             yield ""
 
     def _init(self) -> Iterator[str]:
@@ -319,7 +319,7 @@ class _Source:
                 yield from self._stored(f"state->{field}", kept.updates, c_type(kept.dtype))
 
 
-def write_c(agent: Agent, folder: str | os.PathLike[str]) -> list[Path]:
+def write_c(agent: ExportedAgent, folder: str | os.PathLike[str]) -> list[Path]:
     """Write an agent as C99: a header and a source file, which need nothing but the C library.
 
     Args:

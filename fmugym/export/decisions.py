@@ -1,4 +1,4 @@
-"""What lies between an observation and an action: a network, and what else an agent computes."""
+"""Decision of an agent: the network and other formulas between observation and action."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fmugym.export.network import Activation, Layer, Network, Scaling
 from fmugym.export.policies import network_of_model
 from fmugym.expressions.value import Value
 from fmugym.scaling import are_scaled
-from fmugym.search.policy import LIMIT, Agent, Policy
+from fmugym.search.policy import LIMIT, ResidualAgent, ResidualPolicy
 from fmugym.search.residual import Residual
 
 __all__ = ["Decision", "decision_of"]
@@ -36,14 +36,14 @@ def _decided_by_any(seen: Sequence[Value], memory: Sequence[Any], ask: _Ask) -> 
 
 @dataclass(frozen=True)
 class Decision:
-    """How an agent decides; by default any action may follow from the observation.
+    """Decision rule of an agent; by default any action may follow from the observation.
 
     Attributes:
         network: Its network; None for none.
         decide: Takes formulas: the elements of the observation, what the agent remembers, and a
             function that asks the network for its last values, or for any action if there is none.
             Returns the elements of the action, and what the agent remembers then.
-        starts: What it remembers at the beginning of an episode, by name.
+        starts: Memory at the beginning of an episode, by name.
     """
 
     network: Network | None = None
@@ -52,7 +52,7 @@ class Decision:
 
 
 def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
-    """Find how an agent decides.
+    """Make the decision rule of an agent.
 
     Args:
         env: The environment.
@@ -62,9 +62,9 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     Raises:
         ConfigError: If the agent cannot be exported, or is for another task.
     """
-    model = model.policy() if isinstance(model, Agent) else model
+    model = model.policy() if isinstance(model, ResidualAgent) else model
     if isinstance(model, Controller):
-        policy = copy(model) if isinstance(model, Policy) else Policy(model)
+        policy = copy(model) if isinstance(model, ResidualPolicy) else ResidualPolicy(model)
         policy.baseline = deepcopy(policy.baseline)
         return _of_policy(policy.bind(env))
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
@@ -73,7 +73,7 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     return Decision(network, lambda seen, memory, ask: (network.chosen(ask(seen)), ()))
 
 
-def _of_policy(policy: Policy) -> Decision:
+def _of_policy(policy: ResidualPolicy) -> Decision:
     if policy.choices and policy.masks is not None:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
     controller, past = policy.baseline, policy.starts
@@ -107,8 +107,8 @@ def _of_policy(policy: Policy) -> Decision:
     return Decision(network, decide, starts)
 
 
-def _network_of(policy: Policy) -> tuple[Network | None, _Ask]:
-    """The network, and what its last values mean.
+def _network_of(policy: ResidualPolicy) -> tuple[Network | None, _Ask]:
+    """Read the network, and the meaning of its last values.
 
     There is none if nobody corrects the controller, or the network sees nothing and so gives
     constants.

@@ -1,4 +1,4 @@
-"""An agent with everything around its network, ready to be written in some form."""
+"""Exported agents: agents with all formulas around their networks, ready to be written."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from fmugym.errors import ConfigError, shown
 from fmugym.export.decisions import decision_of
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
-from fmugym.search.policy import Agent as FoundAgent
+from fmugym.search.policy import ResidualAgent
 
-__all__ = ["Agent", "agent_of", "check_name"]
+__all__ = ["ExportedAgent", "agent_of", "check_name"]
 
 
 _TAKEN: Final = frozenset(
@@ -25,16 +25,16 @@ _TAKEN: Final = frozenset(
     | {f"fmi{n}{part}" for n in (2, 3) for part in ("Functions", "FunctionTypes", "TypesPlatform")}
     | {"fmi3PlatformTypes"}
 )
-"""The headers and sources that stand beside those of an agent."""
+"""Headers and sources beside those of an agent, whose names are taken."""
 
 
 @dataclass(frozen=True)
-class Agent:
+class ExportedAgent:
     """An agent of a task.
 
     Attributes:
-        name: What functions and files are called by.
-        logic: What surrounds the network.
+        name: Name of functions and files.
+        logic: Logic around the network.
         network: The network; None for none.
         notes: Lines that tell a reader what it is.
         units: The units of the plant by name.
@@ -62,7 +62,7 @@ def agent_of(
     name: str = "agent",
     all_inputs: bool = False,
     external: Collection[str] = (),
-) -> Agent:
+) -> ExportedAgent:
     """Put an agent together from its task and its policy.
 
     Args:
@@ -71,7 +71,7 @@ def agent_of(
         model: An agent that a search has found, or its policy; a ``PID``, a ``Hysteresis`` or an
             ``LQR``; a model of Stable-Baselines3 or sb3-contrib; or a ``Network``.
         normalization: The ``VecNormalize`` of the training; None if there was none.
-        name: What functions and files are called by: letters, digits and _.
+        name: Name of functions and files: letters, digits and _.
         all_inputs: Whether the agent also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
         external: The names of data that the agent is given as measurements, forecasts of them
@@ -83,11 +83,13 @@ def agent_of(
     check_name(name)
     decision = decision_of(env, model, normalization)
     logic = logic_of(env, decision, all_inputs=all_inputs, external=external)
-    return Agent(name, logic, decision.network, _notes(env, model), env.fmu.description.units)
+    return ExportedAgent(
+        name, logic, decision.network, _notes(env, model), env.fmu.description.units
+    )
 
 
 def check_name(name: str) -> str:
-    """Check what functions and files are called by, and return it.
+    """Check and return the name of functions and files.
 
     Raises:
         ConfigError: If it has more than letters, digits and _, or is that of another file.
@@ -103,7 +105,7 @@ def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:
     spec = getattr(env, "spec", None)
     task = type(env).__name__ if spec is None else str(spec.id)
     policy = type(model).__name__
-    if isinstance(model, FoundAgent):
+    if isinstance(model, ResidualAgent):
         policy = model.name if model.text is None else f"{model.name} ({model.text})"
     return (
         f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {policy}.",

@@ -1,4 +1,4 @@
-"""Data of a task that somebody else gives the controller: measured weather, forecasts, prices."""
+"""External data of a controller, given at run time: measured weather, forecasts, prices."""
 
 from __future__ import annotations
 

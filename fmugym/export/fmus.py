@@ -18,15 +18,15 @@ from fmugym.checks import check_option
 from fmugym.errors import ConfigError
 from fmugym.export.building import PLATFORMS, compiled
 from fmugym.export.c99 import field_names, header, source
-from fmugym.export.exportable import Agent
+from fmugym.export.exportable import ExportedAgent
 from fmugym.export.layers import c_type
-from fmugym.export.model_description import Port, kind_of, model_description, ports_of
+from fmugym.export.model_description import AgentVariable, kind_of, model_description, ports_of
 from fmugym.export.names import new_file
 from fmugym.export.operations import constant
 
-__all__ = ["FMI_VERSIONS", "write_fmu"]
+__all__ = ["EXPORT_VERSIONS", "write_fmu"]
 
-FMI_VERSIONS: Final = ("2.0", "3.0")
+EXPORT_VERSIONS: Final = ("2.0", "3.0")
 _HEADERS: Final = {
     "2.0": ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
     "3.0": ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
@@ -35,7 +35,7 @@ _DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 
 def write_fmu(
-    agent: Agent,
+    agent: ExportedAgent,
     path: str | os.PathLike[str],
     *,
     fmi_version: str = "2.0",
@@ -51,7 +51,7 @@ def write_fmu(
         agent: The agent. Its name is that of the model.
         path: The file, which must not exist.
         fmi_version: ``"2.0"`` or ``"3.0"``.
-        platforms: Of ``fmugym.export.building.PLATFORMS``; by default that of this machine.
+        platforms: Platforms of ``fmugym.export.building.PLATFORMS``; by default of this machine.
 
     Returns:
         The path.
@@ -62,7 +62,7 @@ def write_fmu(
         FileExistsError: If the file exists.
     """
     file = new_file(path)
-    check_option("fmi_version", fmi_version, FMI_VERSIONS)
+    check_option("fmi_version", fmi_version, EXPORT_VERSIONS)
     names = [str(fmpy.platform_tuple)] if platforms is None else list(platforms)
     for name in names:
         check_option("platform", name, PLATFORMS)
@@ -76,7 +76,7 @@ def write_fmu(
     return file
 
 
-def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
+def _write_sources(agent: ExportedAgent, fmi_version: str, folder: Path) -> str:
     """Write all sources to a folder, and return the token of the FMU."""
     ports = ports_of(agent, fmi_version)
     texts = {f"{agent.name}.h": header(agent), f"{agent.name}.c": source(agent)}
@@ -95,8 +95,8 @@ def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
     return token
 
 
-def _model(agent: Agent, ports: Sequence[Port], token: str) -> str:
-    """What the functions of FMI need to know of the agent."""
+def _model(agent: ExportedAgent, ports: Sequence[AgentVariable], token: str) -> str:
+    """Write the constants of an agent that the functions of FMI need."""
     name, logic = agent.name, agent.logic
     starts = [constant(one.start, "d") for one in ports if one.causality == "input"]
     fixed = [
@@ -126,7 +126,7 @@ static const bool is_fixed[] = {{{", ".join([*fixed, "false"])}}};
 {_parameters(agent)}"""
 
 
-def _parameters(agent: Agent) -> str:
+def _parameters(agent: ExportedAgent) -> str:
     fields, logic = field_names(agent), agent.logic
     gets = sets = ""
     for number, one in enumerate(logic.parameters):
@@ -145,7 +145,7 @@ static void set_parameter(AGENT_STATE *agent, unsigned place, double value) {{
 """
 
 
-def _build_description(agent: Agent) -> str:
+def _build_description(agent: ExportedAgent) -> str:
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<fmiBuildDescription fmiVersion="3.0">\n'
@@ -160,7 +160,7 @@ def _build_description(agent: Agent) -> str:
 
 
 def _binaries(
-    agent: Agent, fmi_version: str, folder: Path, platforms: Sequence[str]
+    agent: ExportedAgent, fmi_version: str, folder: Path, platforms: Sequence[str]
 ) -> dict[str, bytes]:
     """The libraries by their paths in the archive."""
     sources, libraries = [f"{agent.name}.c", f"agent_fmi{fmi_version[0]}.c"], dict[str, bytes]()

@@ -1,4 +1,4 @@
-"""What of sensors and actuators belongs to the plant, and not to its controller."""
+"""Imperfections of sensors and actuators, which a plant has and its controller leaves out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OF_ACTUATORS: Final = ("delay", "bias", "noise", "drop_out")
 
 @contextmanager
 def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
-    """Give an environment whose sensors are ideal: their readings are what a controller is given.
+    """Give an environment ideal sensors, so that a controller reads what they measure.
 
     The delay, bias, noise and drop-outs of actuators, errors of forecasts and warm-ups are left
     out, too: they happen to the controller, and are not its doing.

@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.network import Activation, Network
-from fmugym.export.operations import TYPES, constant
+from fmugym.export.operations import C_TYPES, constant
 
 __all__ = ["array", "bare", "c_type", "network_lines"]
 
@@ -22,9 +22,9 @@ def c_type(dtype: np.dtype[Any]) -> str:
     Raises:
         ConfigError: If C has none.
     """
-    if dtype.char not in TYPES:
+    if dtype.char not in C_TYPES:
         raise ConfigError(f"values of type {dtype} cannot be exported to C")
-    return TYPES[dtype.char]
+    return C_TYPES[dtype.char]
 
 
 def bare(text: str) -> str:
@@ -101,7 +101,7 @@ static void {name}_network(const {kind} *features, {kind} *given) {{"""
 
 
 def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:
-    kind = TYPES[letter]
+    kind = C_TYPES[letter]
     arrays = ["features", *(f"values_{i}" for i in range(len(network.layers) - 1)), "given"]
     widths = [network.width, *(len(layer.bias) for layer in network.layers)]
     for array, width in zip(arrays[1:-1], widths[1:-1], strict=True):
@@ -120,6 +120,6 @@ def _activation_lines(activation: Activation, array: str, width: int, letter: st
     suffix = "f" if letter == "f" else ""
     text = _ACTIVATIONS[activation.name].format(*numbers, f=suffix)
     yield f"    for (int i = 0; i < {width}; i++) {{"
-    yield f"        const {TYPES[letter]} x = {array}[i];"
+    yield f"        const {C_TYPES[letter]} x = {array}[i];"
     yield f"        {array}[i] = {text};"
     yield "    }"

@@ -1,4 +1,4 @@
-"""What surrounds the network of an agent: from measurements to its features, and to inputs.
+"""Logic around the network of an agent: features from measurements, inputs from actions.
 
 It consists of the formulas of the task, and between them of those of the agent. Between two samples
 a controller knows its measurements and what it has kept: earlier measurements, actions and inputs,
@@ -34,7 +34,7 @@ from fmugym.vector.hooks.formula_programs import Translation, written_variables
 __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
 
 Load = tuple[Any, ...]
-"""Where a value comes from: ``("measurement", i)``, ``("kept", field, i)``, ``("count",)``,
+"""Source of a value: ``("measurement", i)``, ``("kept", field, i)``, ``("count",)``,
 ``("active",)``, ``("given", i)`` by the network, or ``("constant", value)``."""
 
 _GIVEN: Final = "given"
@@ -85,13 +85,13 @@ class Logic:
 
     Attributes:
         graph: The operations.
-        loads: Where the values that it loads come from, by node.
+        loads: Sources of loaded values, by node.
         measurements: The plant's outputs that it reads.
         inputs: The plant's inputs that it writes.
         input_nodes: The node of each.
         features: The nodes of what the network takes; none if there is no network.
-        kept: What it keeps.
-        parameters: What was drawn in each episode.
+        kept: Kept values.
+        parameters: Drawn parameters of each episode.
         time_step: From one sample to the next, in seconds.
     """
 
@@ -119,7 +119,7 @@ def logic_of(
     all_inputs: bool = False,
     external: Collection[str] = (),
 ) -> Logic:
-    """Find what a task and its agent do between measurements and inputs, but for the network.
+    """Make the logic between measurements and inputs, without the network.
 
     Args:
         env: The environment. It is not stepped. What its sensors and actuators do is left out; see
@@ -165,7 +165,7 @@ _KEYS: Final[Mapping[str, str]] = {
 
 
 def _formulas_of(env: FMUEnv) -> Formulas:
-    """The formulas of a task; those of hooks that no controller needs may be missing.
+    """Formulas of a task; formulas of hooks that no controller needs may be missing.
 
     Raises:
         ConfigError: If a hook is a function of Python.
@@ -184,8 +184,8 @@ class _Sample:
 
     Args:
         env: The environment.
-        formulas: Those of its task.
-        decision: What the agent computes.
+        formulas: Formulas of its task.
+        decision: Decision of the agent.
 
     Attributes:
         graph: The operations.
@@ -223,7 +223,7 @@ class _Sample:
     def _decided(
         self, observation: Sequence[Value]
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
-        """The action, and what the agent remembers then."""
+        """Action of a sample, and the memory of the agent after it."""
         memory = [
             [self._row("before", name, index) for index in range(start.size)]
             for name, start in self._decision.starts.items()
@@ -261,7 +261,7 @@ class _Sample:
 
 
 def _row_of(node: Node) -> Any:
-    """The row that a node loads; that of a variable is the same between two samples."""
+    """Row that a node loads; a variable has the same row between two samples."""
     row: Any = node.what
     return ("before", *row[1:]) if row[0] == "variable" else row
 
@@ -271,7 +271,7 @@ def _nodes(values: Iterable[Value]) -> tuple[int, ...]:
 
 
 class _Assembly:
-    """Makes a ``Logic`` of a sample: only what the actions depend on is kept."""
+    """Makes a ``Logic`` of a sample, and keeps only the nodes on which the actions depend."""
 
     def __init__(
         self,
@@ -327,7 +327,7 @@ class _Assembly:
         )
 
     def _reads(self, needed: Iterable[int]) -> defaultdict[str, list[Any]]:
-        """What some nodes read, by kind: the rest of rows, and elements of actions."""
+        """Rows and elements of actions that some nodes read, by kind."""
         found = defaultdict(list)
         for number in sorted(needed):
             node = self._graph.nodes[number]
@@ -336,7 +336,7 @@ class _Assembly:
         return found
 
     def _next_values(self, needed: Iterable[int]) -> Iterator[int]:
-        """The nodes of what is kept for the next sample."""
+        """Nodes of the values that are kept for the next sample."""
         reads = self._reads(needed)
         for name, *_ in reads["before"]:
             yield from self._sample.updates.get(name, ())
@@ -359,7 +359,7 @@ class _Assembly:
                 )
         return places
 
-    # What is kept.
+    # Kept values.
 
     def _add_fields(self, needed: set[int], places: list[int]) -> None:
         reads = self._reads(needed)
@@ -424,7 +424,7 @@ class _Assembly:
     # Where values come from.
 
     def _load(self, number: int, places: list[int]) -> Load | None:
-        """Where a node's value comes from; None if it is computed, or a constant."""
+        """Source of a node's value; None for a computed value or a constant."""
         node = self._graph.nodes[number]
         what: Any = node.what
         if number in self._external:

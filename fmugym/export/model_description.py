@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.archive.variable import Variable
-from fmugym.export.exportable import Agent
+from fmugym.export.exportable import ExportedAgent
 
-__all__ = ["Port", "kind_of", "model_description", "ports_of"]
+__all__ = ["AgentVariable", "kind_of", "model_description", "ports_of"]
 
 _KINDS: Final[Mapping[str, str]] = {
     "Float64": "d",
@@ -37,7 +37,7 @@ _OF_FMI_3: Final = {"Real": "Float64", "Integer": "Int32", "Enumeration": "Int64
 
 
 @dataclass(frozen=True)
-class Port:
+class AgentVariable:
     """A variable of an exported agent.
 
     Attributes:
@@ -57,12 +57,12 @@ class Port:
     variable: Variable | None
 
 
-def kind_of(port: Port) -> str:
+def kind_of(port: AgentVariable) -> str:
     """The letter of a port's type."""
     return _KINDS[port.type]
 
 
-def ports_of(agent: Agent, fmi_version: str) -> list[Port]:
+def ports_of(agent: ExportedAgent, fmi_version: str) -> list[AgentVariable]:
     """The variables of an agent, in the order of their value references from 1 on."""
     logic = agent.logic
     ports = [
@@ -74,7 +74,7 @@ def ports_of(agent: Agent, fmi_version: str) -> list[Port]:
     for one in logic.parameters:
         name = one.name if one.name not in taken else f"{one.name}_parameter"
         variability = "fixed" if logic.kept[one.field].updates else "tunable"
-        ports.append(Port(name, "parameter", variability, number, one.start, one.variable))
+        ports.append(AgentVariable(name, "parameter", variability, number, one.start, one.variable))
     return ports
 
 
@@ -82,17 +82,19 @@ def _finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-def _port(variable: Variable, causality: str, fmi_version: str, start: float | None) -> Port:
+def _port(
+    variable: Variable, causality: str, fmi_version: str, start: float | None
+) -> AgentVariable:
     if fmi_version == "2.0":
         kind = _OF_FMI_2.get(variable.kind, "Integer")
     else:
         kind = _OF_FMI_3.get(variable.type, variable.type)
     is_continuous = kind in _FLOATS and causality == "input"
     variability = "continuous" if is_continuous else "discrete"
-    return Port(variable.name, causality, variability, kind, start, variable)
+    return AgentVariable(variable.name, causality, variability, kind, start, variable)
 
 
-def model_description(agent: Agent, fmi_version: str, token: str) -> bytes:
+def model_description(agent: ExportedAgent, fmi_version: str, token: str) -> bytes:
     """Write a model description.
 
     Args:
@@ -108,7 +110,7 @@ def model_description(agent: Agent, fmi_version: str, token: str) -> bytes:
     ElementTree.SubElement(categories, "Category", name="logStatusError")
     step = repr(agent.logic.time_step)
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)
-    time = Port("time", "independent", "continuous", writer.number, None, None)
+    time = AgentVariable("time", "independent", "continuous", writer.number, None, None)
     variables = ElementTree.SubElement(root, "ModelVariables")
     for reference, port in enumerate([time, *ports]):
         writer.add_variable(variables, port, _facts(port, reference))
@@ -119,7 +121,7 @@ def model_description(agent: Agent, fmi_version: str, token: str) -> bytes:
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
 
 
-def _add_units(root: Any, ports: Sequence[Port], units: Mapping[str, Unit]) -> None:
+def _add_units(root: Any, ports: Sequence[AgentVariable], units: Mapping[str, Unit]) -> None:
     used = dict.fromkeys(one.variable.unit for one in ports if one.variable is not None)
     names = [name for name in used if name]
     if not names:
@@ -138,7 +140,7 @@ def _add_units(root: Any, ports: Sequence[Port], units: Mapping[str, Unit]) -> N
 
 
 class _Writer:
-    """What both FMI versions have."""
+    """Writer of the parts of a model description that both FMI versions share."""
 
     version: str
     number: str
@@ -148,7 +150,7 @@ class _Writer:
     state: str
     """How the names of functions for states end."""
 
-    def root(self, agent: Agent, token: str) -> Any:
+    def root(self, agent: ExportedAgent, token: str) -> Any:
         facts = {
             "fmiVersion": self.version,
             "modelName": agent.name,
@@ -173,7 +175,7 @@ class _Writer2(_Writer):
 
     version, number, token, state = "2.0", "Real", "guid", "FMUstate"
 
-    def root(self, agent: Agent, token: str) -> Any:
+    def root(self, agent: ExportedAgent, token: str) -> Any:
         root = super().root(agent, token)
         root.set("numberOfEventIndicators", "0")
         root[0].set("canNotUseMemoryManagementFunctions", "true")
@@ -182,7 +184,7 @@ class _Writer2(_Writer):
             ElementTree.SubElement(files, "File", name=name)
         return root
 
-    def add_variable(self, section: Any, port: Port, facts: dict[str, str]) -> None:
+    def add_variable(self, section: Any, port: AgentVariable, facts: dict[str, str]) -> None:
         element = ElementTree.SubElement(section, "ScalarVariable", facts)
         ElementTree.SubElement(element, port.type, _of_type(port))
 
@@ -199,7 +201,7 @@ class _Writer3(_Writer):
 
     version, number, token, state = "3.0", "Float64", "instantiationToken", "FMUState"
 
-    def add_variable(self, section: Any, port: Port, facts: dict[str, str]) -> None:
+    def add_variable(self, section: Any, port: AgentVariable, facts: dict[str, str]) -> None:
         ElementTree.SubElement(section, port.type, facts | _of_type(port))
 
     def add_structure(self, section: Any, outputs: Sequence[int]) -> None:
@@ -214,7 +216,7 @@ def _dependencies(section: str) -> dict[str, str]:
     return {} if section.startswith("Initial") else {"dependencies": ""}
 
 
-def _facts(port: Port, reference: int) -> dict[str, str]:
+def _facts(port: AgentVariable, reference: int) -> dict[str, str]:
     facts = {
         "name": port.name,
         "valueReference": str(reference),
@@ -228,7 +230,7 @@ def _facts(port: Port, reference: int) -> dict[str, str]:
     return facts
 
 
-def _of_type(port: Port) -> dict[str, str]:
+def _of_type(port: AgentVariable) -> dict[str, str]:
     """The attributes that depend on the type."""
     facts = {} if port.start is None else {"start": _written(port.start, port.type)}
     if port.variable is None or port.type == "Boolean":

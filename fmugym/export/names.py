@@ -22,7 +22,7 @@ public register reinterpret_cast requires restrict return short signed sizeof st
 static_assert static_cast struct switch template this thread_local throw true try typedef
 typeid typename union unsigned using virtual void volatile wchar_t while xor xor_eq
 """
-"""Words that name no field: those of C and C++, and those that the files use."""
+"""Words that cannot name a field: keywords of C and C++, and names that the files use."""
 
 
 def identifier(text: str) -> str:

@@ -1,4 +1,4 @@
-"""Networks as data: layers of weights, what leads into them, and how they choose an action."""
+"""Networks as data: layers of weights, features, and the choice of an action."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fmugym.errors import ConfigError, shown
 
 __all__ = ["ACTIVATIONS", "Activation", "Layer", "Network", "Scaling", "network_of"]
 
-FloatArray = npt.NDArray[Any]
+_Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class Activation:
     name: str
     arguments: tuple[float, ...] = ()
 
-    def __call__(self, values: FloatArray) -> FloatArray:
+    def __call__(self, values: _Array) -> _Array:
         """Apply the function."""
-        result: FloatArray = ACTIVATIONS[self.name](values, *self.arguments)
+        result: _Array = ACTIVATIONS[self.name](values, *self.arguments)
         return result.astype(values.dtype)
 
 
-def _softplus(x: FloatArray, beta: float, threshold: float) -> FloatArray:
+def _softplus(x: _Array, beta: float, threshold: float) -> _Array:
     scaled = x * beta
     return np.where(scaled > threshold, x, np.log1p(np.exp(np.minimum(scaled, threshold))) / beta)
 
@@ -52,7 +52,7 @@ ACTIVATIONS: Final[dict[str, Callable[..., Any]]] = {
     "softplus": _softplus,
     "clamp": lambda x, low, high: np.clip(x, low, high),
 }
-"""The functions by name; their constants are those of PyTorch's modules."""
+"""Activation functions by name, with the constants of PyTorch's modules."""
 
 _MODULES: Final[dict[str, Callable[[Any], Activation]]] = {
     "Tanh": lambda m: Activation("tanh"),
@@ -79,8 +79,8 @@ class Layer:
         activations: Applied in this order.
     """
 
-    weights: FloatArray
-    bias: FloatArray
+    weights: _Array
+    bias: _Array
     activations: tuple[Activation, ...] = ()
 
 
@@ -93,9 +93,9 @@ class Scaling:
         limit: The largest magnitude of each element afterwards; infinite for none.
     """
 
-    mean: FloatArray
-    divisor: FloatArray
-    limit: FloatArray
+    mean: _Array
+    divisor: _Array
+    limit: _Array
 
     def __call__(self, observation: Iterable[Any]) -> list[Any]:
         """Normalize the elements of an observation, numbers or formulas, with float64."""
@@ -135,12 +135,12 @@ class Network:
 
     @property
     def width(self) -> int:
-        """How many values it takes."""
+        """Number of inputs of the network."""
         return int(self.layers[0].weights.shape[1])
 
     @property
     def parts(self) -> tuple[int, ...]:
-        """How many of the last values decide on each element of the action."""
+        """Numbers of last values that decide on each element of the action."""
         space: Any = self.space
         if isinstance(space, spaces.Discrete):
             return (int(space.n),)
@@ -170,19 +170,19 @@ class Network:
         return replace(self, layers=(*self.layers, Layer(np.diag(half), middle)), space=space)
 
     def scaled(self, observation: Sequence[Any]) -> Sequence[Any]:
-        """What the first layer takes, in its type then, of numbers or formulas."""
+        """Scale numbers or formulas to inputs of the first layer, in its type."""
         return observation if self.scaling is None else self.scaling(observation)
 
-    def values(self, observation: FloatArray) -> FloatArray:
+    def values(self, observation: _Array) -> _Array:
         """The last values for an observation of shape (k,)."""
-        values: FloatArray = np.array(self.scaled([*observation]), self.dtype)
+        values: _Array = np.array(self.scaled([*observation]), self.dtype)
         for layer in self.layers:
             values = layer.weights @ values + layer.bias
             for activation in layer.activations:
                 values = activation(values)
         return values
 
-    def action(self, observation: FloatArray) -> FloatArray:
+    def action(self, observation: _Array) -> _Array:
         """The action for an observation of shape (k,), flat."""
         return np.array(self.chosen([*self.values(observation)]), self.space.dtype)
 
@@ -208,7 +208,7 @@ class Network:
 
 
 def _place_of_largest(values: Sequence[Any]) -> Any:
-    """The place of the largest value, the first one of several."""
+    """Index of the largest value; of equal ones, the first."""
     place, largest = 0, values[0]
     for index, one in enumerate(values[1:], 1):
         is_larger = one > largest
@@ -262,8 +262,8 @@ def _linear(module: Any) -> Layer:
     return Layer(weights, bias)
 
 
-def _numbers(tensor: Any) -> FloatArray:
-    array: FloatArray = tensor.detach().cpu().numpy().copy()
+def _numbers(tensor: Any) -> _Array:
+    array: _Array = tensor.detach().cpu().numpy().copy()
     if array.dtype not in (np.float32, np.float64) or not np.isfinite(array).all():
         raise ConfigError(
             f"the weights of a network must be finite numbers of type float32 or float64, got "

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.export.c99 import field_names
-from fmugym.export.exportable import Agent
+from fmugym.export.exportable import ExportedAgent
 from fmugym.export.names import new_file
 from fmugym.export.network import Activation, Network
 from fmugym.export.onnx_nodes import Nodes
@@ -28,7 +28,7 @@ _WHOLE: Final = np.dtype(np.int64)
 _DOUBLE: Final = np.dtype(np.float64)
 
 
-def write_onnx(agent: Agent, path: str | os.PathLike[str]) -> Path:
+def write_onnx(agent: ExportedAgent, path: str | os.PathLike[str]) -> Path:
     """Write an agent as an ONNX model.
 
     The model takes ``measurements`` of type float64, shape (N, m), and gives ``actions`` of shape
@@ -54,7 +54,7 @@ def write_onnx(agent: Agent, path: str | os.PathLike[str]) -> Path:
     return file
 
 
-def onnx_model(agent: Agent) -> Any:
+def onnx_model(agent: ExportedAgent) -> Any:
     """Make the model of ``write_onnx``, a ``ModelProto``."""
     return _Model(agent).model()
 
@@ -62,7 +62,7 @@ def onnx_model(agent: Agent) -> Any:
 class _Model:
     """Makes the model of one agent."""
 
-    def __init__(self, agent: Agent) -> None:
+    def __init__(self, agent: ExportedAgent) -> None:
         self._agent, self._logic = agent, agent.logic
         self._onnx, self._nodes = imported("onnx", "onnx"), Nodes()
         self._fields = field_names(agent)

@@ -1,4 +1,4 @@
-"""A graph of ONNX in the making."""
+"""Builder of a graph of ONNX."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ _COMPOSED: Final[Mapping[str, Callable[..., Any]]] = {
 
 
 class Operations:
-    """Writes what a graph computes as nodes of ONNX.
+    """Writes the operations of a graph as nodes of ONNX.
 
     Args:
         nodes: Takes the nodes.
@@ -98,7 +98,7 @@ class Operations:
         self._names: dict[int, str] = {}
 
     def written(self, numbers: Iterable[int]) -> list[str]:
-        """Write some operations, and those that they need; returns the names of their results.
+        """Write operations, and the ones that they need; returns the names of their results.
 
         Raises:
             ConfigError: If one cannot be written.
@@ -163,10 +163,10 @@ class Operations:
         return name
 
     def _interpolated(self, number: int, table: Any) -> str:
-        """A value between those of a table, as ``numpy.interp`` finds it.
+        """Interpolate a value in a table, as ``numpy.interp`` does.
 
         Args:
-            number: Where to look.
+            number: Position in the table.
             table: The arguments, the values, and the values before the first and after the last.
         """
         count, nodes, x = len(table) // 2 - 1, self._nodes, self._value(number)

@@ -10,9 +10,9 @@ import numpy as np
 from fmugym.errors import ConfigError
 from fmugym.expressions.program import letter_of, operation_of
 
-__all__ = ["HELPERS", "TYPES", "constant", "expression"]
+__all__ = ["C_TYPES", "HELPERS", "constant", "expression"]
 
-TYPES: Final[Mapping[str, str]] = {
+C_TYPES: Final[Mapping[str, str]] = {
     "d": "double",
     "f": "float",
     "?": "bool",
@@ -88,7 +88,7 @@ def constant(value: Any, letter: str) -> str:
 def _float(value: Any, letter: str) -> str:
     if not np.isfinite(value):
         text = "NAN" if np.isnan(value) else "INFINITY"
-        return f"(-({TYPES[letter]}){text})" if value < 0 else f"(({TYPES[letter]}){text})"
+        return f"(-({C_TYPES[letter]}){text})" if value < 0 else f"(({C_TYPES[letter]}){text})"
     text = str(np.float32(value)) if letter == "f" else repr(float(value))
     text = text if "." in text or "e" in text else f"{text}.0"
     text += "f" if letter == "f" else ""

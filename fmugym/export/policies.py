@@ -17,7 +17,8 @@ __all__ = ["network_of_model"]
 
 _TRIALS: Final = 64
 _TOLERANCE: Final = 1e-4
-"""Of the range of the actions: what the order of sums makes of float32."""
+"""Difference from float32 that another order of sums may cause, as a part of the range of
+actions."""
 
 _DISTRIBUTIONS: Final = (
     *("DiagGaussianDistribution", "CategoricalDistribution", "MultiCategoricalDistribution"),
@@ -29,7 +30,7 @@ def network_of_model(model: Any, normalization: Any = None) -> Network:
     """Read the deterministic policy of a model.
 
     Args:
-        model: Of Stable-Baselines3 or sb3-contrib, with a network of linear layers.
+        model: Model of Stable-Baselines3 or sb3-contrib, with a network of linear layers.
         normalization: A ``VecNormalize``, or None.
 
     Returns:
@@ -122,7 +123,7 @@ _REFUSED: Final[dict[str, str]] = {
 
 
 def _require_flat(extractor: Any) -> None:
-    """Refuse what does more than flatten an observation."""
+    """Refuse a features extractor that does more than flatten an observation."""
     kind = type(extractor).__name__
     if kind != "FlattenExtractor":
         raise ConfigError(f"a policy whose features come from {kind} cannot be exported")

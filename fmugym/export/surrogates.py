@@ -1,4 +1,4 @@
-"""Surrogates as what can be written: from inputs, and what they keep, to outputs."""
+"""Surrogates as exported agents, from inputs and kept values to outputs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.description import Unit
-from fmugym.export.exportable import Agent, check_name
+from fmugym.export.exportable import ExportedAgent, check_name
 from fmugym.export.logic import Kept, Logic, Parameter
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.value import Value, where
@@ -21,7 +21,7 @@ __all__ = ["agent_of_surrogate"]
 _DOUBLE: Final = np.dtype(np.float64)
 
 
-def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit]) -> Agent:
+def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit]) -> ExportedAgent:
     """A surrogate in the form of an agent: the FMU's inputs are measurements, its outputs actions.
 
     The first sample gives the outputs at the start, and each other one those after a step. What
@@ -29,15 +29,15 @@ def agent_of_surrogate(surrogate: Surrogate, name: str, units: Mapping[str, Unit
 
     Args:
         surrogate: The surrogate.
-        name: What functions and files are called by: letters, digits and _.
-        units: Those of the FMU by name.
+        name: Name of functions and files: letters, digits and _.
+        units: Units of the FMU by name.
 
     Raises:
         ConfigError: If the name cannot be that of a file and a function of C.
     """
     logic = _Writer(surrogate).logic()
     note = f"Surrogate: {surrogate.terms.form}; fitted to simulations of an FMU."
-    return Agent(check_name(name), logic, None, (note,), units, is_plant=True)
+    return ExportedAgent(check_name(name), logic, None, (note,), units, is_plant=True)
 
 
 class _Writer:
@@ -49,7 +49,7 @@ class _Writer:
         self._kept: list[Kept] = []
 
     def logic(self) -> Logic:
-        """From inputs, and what is kept, to outputs."""
+        """Make the logic from inputs and kept values to outputs."""
         surrogate, spec = self._surrogate, self._surrogate.spec
         outputs, lags = len(spec.outputs), surrogate.terms.form.lags
         given = [self._loaded("measurement", place) for place in range(len(spec.inputs))]
@@ -80,7 +80,7 @@ class _Writer:
         )
 
     def _inputs(self, given: Sequence[Value]) -> tuple[list[Value], list[Value]]:
-        """The part of a row, and what is kept of it: inputs, and their changes."""
+        """Part of a row for inputs and their changes, and the values that are kept for it."""
         lags = self._surrogate.terms.form.lags
         kept = self._keeping("inputs", [0.0] * len(given) * lags)
         count = self._loaded("count", dtype=np.dtype(np.int64))
@@ -91,7 +91,7 @@ class _Writer:
         return row, row[: len(kept)]
 
     def _constants(self) -> list[Value]:
-        """The outputs at the start of all episodes, where nothing is set before."""
+        """Outputs at the start of all episodes, if no start values are set."""
         return [Value.of(self._graph, float(one)) for one in self._surrogate.start.weights[:, 0]]
 
     def _loaded(self, *load: Any, dtype: np.dtype[Any] = _DOUBLE) -> Value:

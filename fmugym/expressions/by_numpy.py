@@ -126,7 +126,7 @@ def _cast(dtype: np.dtype[Any], value: Any) -> Any:
 
 
 def _chosen(condition: Any, first: Any, second: Any) -> Any:
-    """The first number where a condition holds, otherwise the second."""
+    """Choose the first number if a condition holds, otherwise the second."""
     if isinstance(condition, bool | np.bool_):
         return np.float64(first if condition else second)  # the type that numpy.where gives
     return np.where(condition, first, second)[()]  # a number if all are numbers
@@ -154,7 +154,7 @@ def _divide(first: Any, second: Any) -> Any:
 
 
 def _remainder(first: Any, second: Any) -> Any:
-    """What is left of a division; by 0, it is NaN."""
+    """Remainder of a division; NaN for a division by 0."""
     try:
         return first % second
     except ZeroDivisionError:
@@ -195,4 +195,4 @@ _OF_PYTHON: Final[Mapping[Any, Callable[..., Any]]] = {
     np.float_power: _power,
     np.power: _power_of_float32,
 }
-"""What takes the place of functions of numpy: on single numbers, it takes far less time."""
+"""Functions of Python in place of numpy's, which take far more time for single numbers."""

@@ -1,4 +1,4 @@
-"""What a task computes around the steps of its FMU, as values of one graph."""
+"""Formulas of a task around the steps of its FMU: updates, rewards and ends in one graph."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Formulas:
     Attributes:
         graph: Has all of them.
         inputs: The FMU's inputs; None for the elements of the action.
-        updates: What is written to episode variables when the FMU has stepped, one after the other.
+        updates: Values that are written to episode variables after a step, one after the other.
         terminated: Whether the task has ended; None for never.
         truncated: Whether the episode is cut off; None for never.
         reward: The reward; None if a hook of a class tells it.

@@ -1,4 +1,4 @@
-"""What a task computes, as a graph of operations on single values."""
+"""Graph of operations on single values, which a task computes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Graph", "Node"]
 
 
 class Node(NamedTuple):
-    """A value of one environment, and how it is computed.
+    """A node of a graph: one value of one environment, computed or read.
 
     Attributes:
         kind: ``constant``, ``row``, ``action``, ``previous_action``, ``active``, ``stopped``,
@@ -53,7 +53,7 @@ class Graph:
         """The numbers of some nodes, and of all that they are computed from.
 
         Args:
-            numbers: Those of the nodes.
+            numbers: Numbers of the nodes.
             known: Nodes whose values are known, so that they need no others.
 
         Returns:
@@ -89,7 +89,7 @@ class Graph:
     def compute(
         self, kind: str, what: Any, operands: tuple[int, ...], dtype: np.dtype[Any], fold: Any
     ) -> int:
-        """A node that is computed from others; that of constants is computed at once, by ``fold``.
+        """Add a node for an operation; ``fold`` computes an operation on constants at once.
 
         Raises:
             UncompilableError: If programs have no values of this type.
@@ -118,7 +118,7 @@ class Graph:
         return self.compute("cast", None, (number,), dtype, lambda value: value.astype(dtype))
 
     def choose(self, condition: int, first: int, second: int) -> int:
-        """The first value where the condition holds, otherwise the second; of the same type."""
+        """Add a node for the first value if a condition holds, otherwise the second."""
         if first == second:
             return first
         dtype = self.nodes[first].dtype

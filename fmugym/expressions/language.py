@@ -64,7 +64,7 @@ _OPERATIONS: Final[Mapping[type[ast.AST], Callable[..., Any]]] = {
 
 
 class Names(NamedTuple):
-    """What names stand for where an expression is evaluated.
+    """Values of the names in an expression.
 
     Attributes:
         graph: Gets the nodes of expressions.
@@ -89,7 +89,7 @@ class Expression:
 
     Attributes:
         text: As the user wrote it.
-        tree: What it consists of.
+        tree: Syntax tree.
     """
 
     text: str
@@ -164,7 +164,7 @@ class Expression:
         """Make nodes of it.
 
         Args:
-            names: What the names stand for.
+            names: Values of the names.
 
         Raises:
             ConfigError: If a name is unknown, or the expression has something that is not in the
@@ -205,7 +205,7 @@ def _parsed(text: str) -> ast.expr:
 
 
 def _misfit(text: str, error: SyntaxError) -> str:
-    """Say what is wrong, and where."""
+    """Describe a mistake and its place."""
     if not error.offset:
         return "it ends too early" if text.strip() else "it is empty"
     column = _column(text, error.offset - 1)
@@ -244,7 +244,7 @@ def _name_of(text: str, node: ast.expr) -> str | None:
 
 
 def _names_in(text: str, node: ast.expr) -> Iterator[str]:
-    """The names in a part of an expression, without those of functions."""
+    """Names in a part of an expression, without names of functions."""
     name = _name_of(text, node)
     if name is not None:
         yield name
@@ -269,7 +269,7 @@ class _Evaluation:
 
     Args:
         text: The expression, for errors.
-        names: What names stand for.
+        names: Values of the names.
     """
 
     def __init__(self, text: str, names: Names) -> None:

@@ -1,4 +1,4 @@
-"""From the graph of what hooks compute to instructions for the native pool."""
+"""Compiler from the graph of a task to instructions of the native pool."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def compile_graph(
 
     Args:
         graph: The operations.
-        stores: What to store, in this order.
+        stores: Values to store, in this order.
         results: The nodes of the results.
         seen: The number of arrays of observations.
 

@@ -1,4 +1,4 @@
-"""The functions of expressions, and others of the same values: random numbers, for example."""
+"""Mathematical functions of expressions, and functions such as random numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Programs: hooks in the form that the native pool runs.
+"""Programs: compiled graphs, which the native pool runs.
 
 A program is a list of instructions on typed registers, each for 128 environments at a time. The
 native pool runs it in the same pass as the FMU's step. What IEEE 754 settles equals numpy to the
@@ -25,10 +25,10 @@ __all__ = [
     "Program",
     "UncompilableError",
     "engine",
-    "evaluate",
     "is_function",
     "letter_of",
     "operation_of",
+    "run_program",
 ]
 
 _OF_EACH_TYPE: Final = (
@@ -41,7 +41,7 @@ _FUNCTIONS: Final = (
     *("arcsinh", "arccosh", "arctanh", "exp", "exp2", "expm1", "log", "log2", "log10", "log1p"),
     *("cbrt", "arctan2", "hypot", "power"),
 )
-"""Those of the C library, whose last bits may differ from numpy's."""
+"""Functions of the C library, whose last bits may differ from numpy's."""
 
 OPERATIONS: Final = (
     *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
@@ -72,7 +72,7 @@ SLOT: Final = np.dtype([("array", "u4"), ("element", "u4"), ("elements", "u4"), 
 
 
 def require_same_table(native: Any) -> None:
-    """Compare the operations with those that the C extension was built with.
+    """Compare the list of operations with that of the C extension.
 
     Args:
         native: The module ``fmugym._native``.
@@ -100,7 +100,7 @@ def engine() -> Any:
 
 
 class UncompilableError(Exception):
-    """An expression has what a program cannot have."""
+    """An expression contains an operation that programs lack."""
 
 
 LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
@@ -176,7 +176,7 @@ class Program:
         return any(row[0] == kind for row in self.rows)
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> Program:
-        """The same program with other tables, by the bytes of those whose place they take."""
+        """Return the program with other tables, by the bytes of the tables that they replace."""
         return replace(self, tables=tuple(tables.get(own.tobytes(), own) for own in self.tables))
 
     def with_rows(
@@ -195,7 +195,7 @@ class Program:
         return form, tuple(map(find, self.rows))
 
 
-def evaluate(
+def run_program(
     program: Program,
     find: Callable[[Row], npt.NDArray[Any]],
     actions: tuple[npt.NDArray[Any], npt.NDArray[Any]],

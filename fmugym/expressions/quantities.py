@@ -1,4 +1,4 @@
-"""The quantities of an episode: what hooks, formulas and snapshots read, and where it is found.
+"""Quantities of an episode: values that hooks, formulas and snapshots read.
 
 From this table come the arrays of N episodes, the numbers of one, the attributes of environments
 that hooks read, the columns of snapshots, and the names that formulas use. A new quantity is a line
@@ -54,7 +54,7 @@ class EpisodeQuantity(NamedTuple):
 
     @property
     def in_hooks(self) -> str:
-        """Where functions of an environment find it."""
+        """Place of the quantity for functions of an environment."""
         return "_episode.outputs" if self.name == "outputs" else self.attribute
 
 

@@ -72,7 +72,7 @@ class Value:
         Args:
             graph: Gets the node.
             name: A quantity, see ``QUANTITIES``; or an attribute of what functions are called with.
-            keys: What to index it with, one key after the other.
+            keys: Indices, one after the other.
             dtype: The type of the value, by default that of the quantity.
         """
         if dtype is None:
@@ -161,7 +161,7 @@ class Value:
 def _loop_of(
     ufunc: np.ufunc, dtypes: tuple[np.dtype[Any], ...]
 ) -> tuple[tuple[np.dtype[Any], ...], np.dtype[Any]]:
-    """The types that a function takes for operands of some types, and that of its value."""
+    """Types of the operands and of the result that a function uses for operands of some types."""
     if set(dtypes) == {_FLAG} and operation_of(ufunc, "?") is None:
         dtypes = (_INTEGER,) * len(dtypes)
     *types, dtype = ufunc.resolve_dtypes((*dtypes, None))
@@ -177,7 +177,7 @@ def _type_of(number: float | bool) -> np.dtype[Any]:
 
 
 def where(condition: Value, first: Value | float, second: Value | float) -> Value:
-    """The first number where a condition holds, otherwise the second."""
+    """Choose the first number if the condition holds, otherwise the second."""
     graph = condition.graph
     nodes = [condition.beside(one).cast(_DOUBLE).node for one in (first, second)]
     return Value(graph, graph.choose(condition.node, *nodes))
@@ -192,4 +192,4 @@ _MADE_OF: Final[Mapping[Any, Callable[[Value], Value]]] = {
 """Functions that operations make up, as numpy does."""
 
 Computed = Value | Sequence["Computed"] | Mapping[str, "Computed"]
-"""What a task computes: one value, or a list or a dict of them."""
+"""Result of a task's formula: one value, or a list or a dict of values."""

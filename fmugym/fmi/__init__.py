@@ -1,4 +1,4 @@
-"""What the versions of FMI have in common: statuses, messages, and the chain rule of systems."""
+"""Common parts of the FMI versions: statuses, messages, and the chain rule of systems."""
 
 from fmugym.fmi.status import Status
 

@@ -1,4 +1,4 @@
-"""The derivatives of a system by the chain rule, from those of its components."""
+"""Chain rule: the derivatives of a system, from the derivatives of its components."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.systems.slots import Layout, Route
 from fmugym.systems.system_description import PartVariable
+from fmugym.systems.system_layout import Route, SystemLayout
 
 __all__ = ["chained_jacobian"]
 
-FloatArray = npt.NDArray[np.float64]
+_FloatArray = npt.NDArray[np.float64]
 Ends = Sequence[Sequence[PartVariable]]
-Differentiate = Callable[[int, tuple[Variable, ...], tuple[Variable, ...]], FloatArray]
+Differentiate = Callable[[int, tuple[Variable, ...], tuple[Variable, ...]], _FloatArray]
 """Takes the number of a component, its k unknowns and its m knowns; gives shape (N, k, m)."""
 
 
 def chained_jacobian(
-    layout: Layout, differentiate: Differentiate, count: int, unknowns: Ends, knowns: Ends
-) -> FloatArray:
+    layout: SystemLayout, differentiate: Differentiate, count: int, unknowns: Ends, knowns: Ends
+) -> _FloatArray:
     """Differentiate variables of a system by others, as if values were exchanged at all times.
 
     What connections carry, y, depends on the knowns k directly and by way of other connections:
@@ -32,8 +32,8 @@ def chained_jacobian(
         layout: The slots and routes of the system.
         differentiate: Differentiates one component of all instances at the present point.
         count: The number N of instances.
-        unknowns: What stands behind each variable to differentiate; the first end counts.
-        knowns: What stands behind each variable to differentiate by: one end or several.
+        unknowns: Ends of the variables to differentiate, in components; the first end counts.
+        knowns: Ends of the variables to differentiate by, in components: one or several.
 
     Returns:
         The partial derivatives, shape (N, len(unknowns), len(knowns)), in the units of the system.
@@ -52,17 +52,21 @@ class _Chain:
     """The derivatives of some variables by connections and by knowns."""
 
     def __init__(
-        self, layout: Layout, differentiate: Differentiate, count: int, routes: Sequence[Route]
+        self,
+        layout: SystemLayout,
+        differentiate: Differentiate,
+        count: int,
+        routes: Sequence[Route],
     ) -> None:
         self._layout, self._differentiate = layout, differentiate
         self._count, self._routes = count, routes
 
-    def by_routes(self, ends: Sequence[PartVariable]) -> FloatArray:
+    def by_routes(self, ends: Sequence[PartVariable]) -> _FloatArray:
         """By the sources of connections, which act on their targets."""
         targets = [[_target(self._layout, route)] for route in self._routes]
         return self.by_knowns(ends, targets)
 
-    def by_knowns(self, ends: Sequence[PartVariable], knowns: Ends) -> FloatArray:
+    def by_knowns(self, ends: Sequence[PartVariable], knowns: Ends) -> _FloatArray:
         """By variables, without the way of connections."""
         result = np.zeros((self._count, len(ends), len(knowns)))
         for part in {end.part for end in ends}:
@@ -80,17 +84,17 @@ def _within(ends: Iterable[PartVariable], part: int) -> list[PartVariable]:
     return [end for end in ends if end.part == part]
 
 
-def _source(layout: Layout, route: Route) -> PartVariable:
+def _source(layout: SystemLayout, route: Route) -> PartVariable:
     part = layout.parts[route.source_part]
     return PartVariable(route.source_part, part.outputs[route.source - part.first_output])
 
 
-def _target(layout: Layout, route: Route) -> PartVariable:
+def _target(layout: SystemLayout, route: Route) -> PartVariable:
     part = layout.parts[route.target_part]
     variable = part.inputs[route.target - part.first_input]
     return PartVariable(route.target_part, variable, route.gain)
 
 
-def _is_continuous(layout: Layout, route: Route) -> bool:
+def _is_continuous(layout: SystemLayout, route: Route) -> bool:
     ends = _source(layout, route).variable, _target(layout, route).variable
     return all(one.kind == "real" and one.variability == "continuous" for one in ends)

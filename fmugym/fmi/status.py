@@ -1,4 +1,4 @@
-"""The status codes of FMI calls."""
+"""Status codes of FMI calls."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def sane(status: int) -> int:
 
 
 def failed_call(doing: str, status: int, where: str) -> str:
-    """Say what a call returned.
+    """Describe the status of a failed call.
 
     Args:
         doing: The call.

@@ -1,4 +1,4 @@
-"""What an FMU said before a call failed: the few messages that tell the cause.
+"""Messages of an FMU before a call failed: the few that tell the cause.
 
 FMUs say much, and the cause is rarely in the last line. An error that quotes everything is not
 read, so a text quotes the messages that report something bad, or the last ones if none does.
@@ -40,10 +40,10 @@ _LACKS: Final = re.compile(
     r"|\bno (\w+ )?(stop|end|final|tolerance|rtol|step|communication)",
     re.IGNORECASE,
 )
-"""How FMUs ask for something."""
+"""Patterns of requests for something."""
 
 _REACHED: Final = re.compile(r"exceed|beyond|\bpast\b|greater|larger|later|reached", re.IGNORECASE)
-"""What is told of a time or tolerance that was given."""
+"""Pattern of a message about a given time or tolerance."""
 
 _KEYS: Final = {
     "stop_time": re.compile(r"\b(stop|end|final)[ _-]?time|\btstop\b", re.IGNORECASE),
@@ -52,7 +52,7 @@ _KEYS: Final = {
         r"step[ _-]?(size|length)|\btime[ _-]?step|\bsample[ _-]?time", re.IGNORECASE
     ),
 }
-"""What an FMU may ask for, by the key of a config that gives it."""
+"""Patterns of requests, by the key of a config that answers them."""
 
 _END: Final = "\x1e"
 """Ends a message in the texts of ``fmugym._native``; see ``native/log.h``."""
@@ -85,7 +85,7 @@ def telling(messages: Sequence[Message]) -> list[str]:
 
 
 def asked_for(text: str) -> str:
-    """The key of a config that gives what an FMU asks for in a text; "" if there is none."""
+    """Key of a config that gives a value for which an FMU asks; "" if there is none."""
     if not _LACKS.search(text):
         return ""
     is_given = _REACHED.search(text)

@@ -1,4 +1,4 @@
-"""A shift between the clocks of inputs and outputs, which looks like a wrong model."""
+"""Shift between the clocks of inputs and outputs, which looks like a wrong model."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from fmugym.pool.base import FloatArray
 __all__ = ["Shift", "shift_of_clocks"]
 
 _ROUNDS: Final = 8
-"""How often values and the shift are fitted in turn."""
+"""Number of times that values and the shift are fitted in turn."""
 
 _LARGEST_GAIN: Final = 10.0
-"""How much larger than the next change the next step may be."""
+"""Largest ratio of the next step to the next change."""
 
 _SAME: Final = 0.02
 """A change of the shift, in sampling intervals, that is too small for another round."""
@@ -37,7 +37,7 @@ _FINE: Final = 8
 
 
 class Shift(NamedTuple):
-    """How late outputs are logged, and what that explains.
+    """Delay of the logged outputs, and the part of the residuals that it explains.
 
     Attributes:
         seconds: By how much the times of the outputs are later than those of the inputs.
@@ -55,7 +55,7 @@ def shift_of_clocks(fit: FitResult, trajectories: Sequence[Trajectory]) -> Shift
 
     Args:
         fit: A fit whose residuals are no noise.
-        trajectories: What it was fitted to.
+        trajectories: Trajectories of the fit.
 
     Returns:
         The shift; None if there is none, or no input tells of it.

@@ -25,22 +25,22 @@ from fmugym.checks import (
     check_number,
     check_seed,
 )
-from fmugym.distributions import Column
+from fmugym.distributions import DrawnColumn
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
-from fmugym.identification.problem import Limits, Problem
-from fmugym.identification.simulator import Experiment
+from fmugym.identification.problem import ParameterLimits, Problem
+from fmugym.identification.simulator import FitSettings
 from fmugym.identification.statistics import Correlation
 from fmugym.identification.trajectory import Trajectory, named_as_own
 from fmugym.pool.base import FloatArray
 
 __all__ = ["FitResult", "fit_of", "fit_parameters"]
 
-GUESS = 12.0
+_GUESS = 12.0
 """One over the variance of a uniform distribution, in units of its range."""
 
-MATTERS = 0.3
+_MATTERS = 0.3
 """Parts of a direction, which has the length 1, that are worth naming."""
 
 
@@ -73,7 +73,7 @@ class FitResult:
     comparison: Comparison
     converged: bool
     message: str
-    experiment: Experiment
+    experiment: FitSettings
     """The settings, which predictions need."""
 
     @property
@@ -114,13 +114,13 @@ class FitResult:
         factor, errors = self.factor(level), self.standard_errors
         return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
 
-    def distributions(self) -> dict[str, Column]:
-        """Return the values as parameters of which each episode draws one of 1000 ``rows``."""
+    def distributions(self) -> dict[str, DrawnColumn]:
+        """Return the parameters as distributions; each episode draws one of 1000 ``rows``."""
         columns = zip(self.values, self.rows(1000).T.tolist(), strict=True)
-        return {name: Column(values, table="fit") for name, values in columns}
+        return {name: DrawnColumn(values, table="fit") for name, values in columns}
 
     def untold(self) -> list[dict[str, float]]:
-        """Name what the data do not tell: combinations of parameters that are hardly determined.
+        """Name combinations of parameters that the data hardly determine.
 
         Along such a direction the standard error is larger than that of a guess within the bounds.
 
@@ -132,9 +132,9 @@ class FitResult:
         scales = np.where(np.isfinite(widths), widths, np.abs([*self.values.values()]))
         told, directions = np.linalg.eigh(self.information * np.outer(scales, scales))
         return [
-            {n: float(x) for n, x in zip(self.values, along, strict=True) if abs(x) > MATTERS}
+            {n: float(x) for n, x in zip(self.values, along, strict=True) if abs(x) > _MATTERS}
             for amount, along in zip(told, directions.T, strict=True)
-            if amount < GUESS
+            if amount < _GUESS
         ]
 
     def rows(self, count: int, seed: int | None = 0) -> FloatArray:
@@ -144,7 +144,7 @@ class FitResult:
 
         Args:
             count: How many.
-            seed: Of the draws.
+            seed: Seed of the draws.
 
         Returns:
             A row for each draw, in the order of ``values``, shape (count, k).
@@ -160,7 +160,7 @@ class FitResult:
         for name, scale in zip(self.values, scales, strict=True):
             if not np.isfinite(scale):
                 raise ConfigError(f"{name!r} has no distribution: give it bounds")
-        told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, GUESS, 0.0))
+        told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, _GUESS, 0.0))
         amounts, directions = np.linalg.eigh(told)
         root = directions / np.sqrt(amounts)
         low, high = np.array([*self.bounds.values()]).T
@@ -203,7 +203,7 @@ class FitResult:
 
     def _for_prediction(
         self, trajectories: Sequence[Trajectory]
-    ) -> tuple[Experiment, list[Trajectory]]:
+    ) -> tuple[FitSettings, list[Trajectory]]:
         """Fix the fitted values, and add fitted constants to the logged inputs."""
         fmu = self.experiment.fmu
         trajectories = named_as_own(trajectories, _own_name_in(fmu))
@@ -215,7 +215,7 @@ class FitResult:
 
 def fit_parameters(
     fmu: FMU | StandsForFMU | str | os.PathLike[str],
-    parameters: Mapping[str, Limits],
+    parameters: Mapping[str, ParameterLimits],
     trajectories: Sequence[Trajectory],
     *,
     initial_states: Mapping[str, str | float] | None = None,
@@ -266,7 +266,7 @@ def fit_parameters(
         raise ConfigError("there is no parameter to fit")
     opened = FMU.of(fmu)
     own_name = _own_name_in(opened)
-    experiment = Experiment(
+    experiment = FitSettings(
         opened,
         by_own_names("initial_states", _mapping("initial_states", initial_states), own_name),
         by_own_names("fixed", _mapping("fixed", fixed), own_name),
@@ -289,8 +289,8 @@ def _own_name_in(fmu: FMU) -> Callable[[str], str]:
 
 
 def fit_of(
-    experiment: Experiment,
-    parameters: Mapping[str, Limits],
+    experiment: FitSettings,
+    parameters: Mapping[str, ParameterLimits],
     trajectories: Sequence[Trajectory],
     candidates: int,
 ) -> FitResult:

@@ -19,7 +19,7 @@ from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
-from fmugym.identification.simulator import Experiment, Simulator
+from fmugym.identification.simulator import FitSettings, Simulator
 from fmugym.identification.statistics import (
     ROUNDING,
     Correlation,
@@ -31,29 +31,29 @@ from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.starting import start_variable
 
-__all__ = ["Limits", "Problem", "start_between"]
+__all__ = ["ParameterLimits", "Problem", "start_between"]
 
-Limits = float | tuple[float, float] | tuple[float, float, float]
+ParameterLimits = float | tuple[float, float] | tuple[float, float, float]
 
-DIFFERENCE = 1e-6
+_DIFFERENCE = 1e-6
 """Step of the finite differences, as a fraction of a value's typical size."""
 
 FAILED = 1e3
 """Residual of a failed simulation, in units of the scale; it keeps the optimizer away."""
 
-MOST_EVALUATIONS = 100
+_MOST_EVALUATIONS = 100
 """Largest number of evaluations of an optimization."""
 
-MAX_ITERATIONS = 50
+_MAX_ITERATIONS = 50
 """Largest number of iterations in the fit of the initial states."""
 
-DESCENTS = 3
+_DESCENTS = 3
 """Of the candidates, as many of the best ones are starts of an optimization."""
 
-REWEIGHTINGS = 2
-"""How often outputs are weighted anew, by the noise that the residuals show."""
+_REWEIGHTINGS = 2
+"""Number of times that outputs are weighted anew, by the noise of the residuals."""
 
-LEAST_NOISE = 1e-6
+_LEAST_NOISE = 1e-6
 """Of an output, as a part of its standard deviation."""
 
 
@@ -110,8 +110,8 @@ class Problem:
 
     def __init__(
         self,
-        experiment: Experiment,
-        parameters: Mapping[str, Limits],
+        experiment: FitSettings,
+        parameters: Mapping[str, ParameterLimits],
         trajectories: Sequence[Trajectory],
     ) -> None:
         outputs, _ = common_names(trajectories)
@@ -132,7 +132,9 @@ class Problem:
         count = 1 + len(self._rows)
         self._simulator = Simulator(experiment, self.trajectories, variables, count)
 
-    def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
+    def _set_limits(
+        self, variables: Sequence[Variable], parameters: Mapping[str, ParameterLimits]
+    ) -> None:
         count = len(parameters)
         limits = [_limits(v, parameters[v.name]) for v in variables[:count]]
         self.bounds = {name: one[1:] for name, one in zip(parameters, limits, strict=True)}
@@ -140,7 +142,7 @@ class Problem:
         starts, self._low, self._high = np.reshape(limits, (-1, 3)).T
         self.start = starts[:count]
         sizes = np.maximum(np.abs(starts), [v.nominal or 0.0 for v in variables])
-        self._differences = DIFFERENCE * np.where(sizes > 0.0, sizes, 1.0)
+        self._differences = _DIFFERENCE * np.where(sizes > 0.0, sizes, 1.0)
 
     def close(self) -> None:
         """Free the simulator."""
@@ -167,9 +169,9 @@ class Problem:
         found.sort(key=lambda one: one[0].cost)
         solution, self._states = found[0]
         spread, costs = self._scales, [float(one.cost) for one, _ in found]
-        for _ in range(0 if all(self._given) or len(self._given) == 1 else REWEIGHTINGS):
+        for _ in range(0 if all(self._given) or len(self._given) == 1 else _REWEIGHTINGS):
             noise = np.sqrt(np.mean(self._series(solution.fun) ** 2, axis=0)) * self._scales
-            noise = np.maximum(noise, LEAST_NOISE * spread)
+            noise = np.maximum(noise, _LEAST_NOISE * spread)
             self._scales = np.where(self._given, self._scales, noise)
             solution = self._descend(solution.x)
         return solution, costs
@@ -200,7 +202,7 @@ class Problem:
         strata = rng.permuted(np.tile(np.arange(candidates), (count, 1)), axis=1)
         points = low + (high - low) * (strata + rng.random(strata.shape)) / candidates
         points[:, 0] = self.start
-        return list(points[:, np.argsort(self._costs(points))[:DESCENTS]].T)
+        return list(points[:, np.argsort(self._costs(points))[:_DESCENTS]].T)
 
     def _costs(self, points: FloatArray) -> FloatArray:
         """The sums of squares at some points, shape (k, n), with the measured initial states."""
@@ -221,7 +223,7 @@ class Problem:
             jac=self._jacobian,
             bounds=(self._low[:count], self._high[:count]),
             x_scale="jac",
-            max_nfev=MOST_EVALUATIONS,
+            max_nfev=_MOST_EVALUATIONS,
         )
 
     def compare(self, parameters: FloatArray, *, refit: bool = True) -> Comparison:
@@ -243,7 +245,7 @@ class Problem:
         )
 
     def uncertainty(self, solution: Any) -> dict[str, Any]:
-        """Say how sure the parameters are, by the attributes of ``FitResult``.
+        """Estimate the uncertainty of the parameters, as attributes of ``FitResult``.
 
         Residuals that are no white noise count as correlated (Newey and West).
         """
@@ -271,7 +273,7 @@ class Problem:
     def _correlated(
         self, solution: Any, correlations: Mapping[str, Correlation]
     ) -> tuple[FloatArray, int]:
-        """The covariance of J' r of residuals that depend on those before, and its freedom."""
+        """Covariance of J' r for correlated residuals, and its degrees of freedom."""
         products = solution.jac * solution.fun[:, np.newaxis]
         sums = products.reshape(-1, len(correlations), len(self.start)).sum(axis=1)
         lags = memory_of(max(one.first for one in correlations.values()), len(sums))
@@ -288,7 +290,7 @@ class Problem:
         return np.split(rows, np.cumsum([one.sum() for one in self._counted])[:-1])
 
     def _residuals(self, parameters: FloatArray) -> FloatArray:
-        """Return what SciPy minimizes: the residuals at the best initial states."""
+        """Residuals that SciPy minimizes, at the best initial states."""
         states, blocks = self._fit_states(parameters)
         self._last = parameters.copy(), states
         residuals = np.concatenate([block.residual for block in blocks])
@@ -369,7 +371,7 @@ def _levenberg_marquardt(
     """
     damping = np.full(states.shape[1], 1e-4)
     blocks = evaluate(states)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         steps = [block.step(factor) for block, factor in zip(blocks, damping, strict=True)]
         if all(block.is_solved(step) for block, step in zip(blocks, steps, strict=True)):
             break
@@ -382,7 +384,7 @@ def _levenberg_marquardt(
     return states, blocks
 
 
-def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
+def _limits(variable: Variable, limits: ParameterLimits) -> tuple[float, float, float]:
     """Return start value, lower and upper bound of a parameter."""
     entries = limits if isinstance(limits, tuple | list | np.ndarray) else (limits,)
     numbers = tuple(float_or_nan(entry) for entry in entries)
@@ -399,7 +401,7 @@ def _limits(variable: Variable, limits: Limits) -> tuple[float, float, float]:
     return numbers[0], numbers[1], numbers[2]
 
 
-def _settable(experiment: Experiment, name: str) -> Variable:
+def _settable(experiment: FitSettings, name: str) -> Variable:
     variable = start_variable(experiment.fmu.description, name, 0.0)
     if variable.kind != "real":
         raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
@@ -413,8 +415,8 @@ def start_between(value: float, low: float, high: float) -> float:
     return value if low <= value <= high else (low + high) / 2
 
 
-def _counted(trajectory: Trajectory, experiment: Experiment) -> MaskArray:
-    """Which samples of a trajectory count: those after the wash-in."""
+def _counted(trajectory: Trajectory, experiment: FitSettings) -> MaskArray:
+    """Samples of a trajectory after the wash-in."""
     since, wash_in = trajectory.time - trajectory.time[0], experiment.wash_in
     begin = -1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0)
     counted = since > begin

@@ -20,13 +20,13 @@ from fmugym.task.pool_opening import PoolOpening
 from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
-__all__ = ["Experiment", "Simulator", "median_interval", "silent"]
+__all__ = ["FitSettings", "Simulator", "median_interval", "silent"]
 
 logger = logging.getLogger(__name__)
 
 WARNING = int(Status.WARNING)
 
-MOST_STEPS = 10_000_000
+_MOST_STEPS = 10_000_000
 """A trajectory that needs more steps has a wrong time step."""
 
 
@@ -35,7 +35,7 @@ def silent(count: float) -> None:
 
 
 @dataclass(frozen=True)
-class Experiment:
+class FitSettings:
     """The common settings of a fit and its predictions; see ``fit_parameters``.
 
     ``plant`` is how an environment opens the FMU,
@@ -75,7 +75,7 @@ class Simulator:
 
     def __init__(
         self,
-        experiment: Experiment,
+        experiment: FitSettings,
         trajectories: Sequence[Trajectory],
         free: Sequence[Variable],
         num_sets: int,
@@ -189,7 +189,7 @@ class _Grid:
 
     def __init__(self, trajectory: Trajectory, step: float) -> None:
         duration = trajectory.time[-1] - trajectory.time[0]
-        if not duration <= MOST_STEPS * step:
+        if not duration <= _MOST_STEPS * step:
             raise ConfigError(
                 f"a time step of {step:g} s is too small for a trajectory of {duration:g} s"
             )

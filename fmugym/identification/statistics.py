@@ -1,4 +1,4 @@
-"""Information, covariances, and what residuals tell."""
+"""Statistics of residuals: information, covariances and correlation."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from fmugym.pool.base import FloatArray
 
 __all__ = ["Correlation", "memory_of", "newey_west", "sandwich"]
 
-RANK_TOLERANCE = 1e-9
+_RANK_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
 
-FALSE_ALARM = 1e-3
-"""How often white noise counts as correlated."""
+_FALSE_ALARM = 1e-3
+"""Share of white noise that counts as correlated."""
 
 ROUNDING = 1e-6
-"""Residuals below this, in units of their scale, are those of the arithmetic."""
+"""Residuals below this, in units of their scale, are rounding errors."""
 
-MOST_LAGS = 20
+_MOST_LAGS = 20
 """Of the autocorrelations that the test for white noise looks at."""
 
 
@@ -39,19 +39,19 @@ def sandwich(jacobian: FloatArray, scores: FloatArray) -> tuple[FloatArray, Floa
     lengths = np.linalg.norm(jacobian, axis=0)
     safe = np.where(lengths > 0, lengths, 1.0)
     _, values, rows = np.linalg.svd(jacobian / safe, full_matrices=False)
-    kept = values > RANK_TOLERANCE * values.max(initial=0.0)
+    kept = values > _RANK_TOLERANCE * values.max(initial=0.0)
     told, bread = rows[kept], values[kept, np.newaxis] ** 2
     middle = (told / safe) @ scores @ (told / safe).T
     narrow, wide = told / bread / safe, told * bread * safe
     covariance = narrow.T @ middle @ narrow
     unknown = np.flatnonzero((np.abs(rows[~kept]) > 1e-6).any(axis=0) | (lengths == 0))
     covariance[unknown, unknown] = np.inf
-    information = wide.T @ np.linalg.pinv(middle, RANK_TOLERANCE, hermitian=True) @ wide
+    information = wide.T @ np.linalg.pinv(middle, _RANK_TOLERANCE, hermitian=True) @ wide
     return covariance, information
 
 
 class Correlation(NamedTuple):
-    """How the residuals of an output depend on those before.
+    """Correlation of the residuals of an output with earlier ones.
 
     Attributes:
         first: The correlation with the residual one sample before.
@@ -67,7 +67,7 @@ class Correlation(NamedTuple):
     def of(cls, residuals: Sequence[FloatArray]) -> Correlation:
         """Judge the residuals of an output, an array (n,) for each experiment."""
         count = sum(map(len, residuals))
-        lags = range(1, 1 + min(MOST_LAGS, max(map(len, residuals)) - 1))
+        lags = range(1, 1 + min(_MOST_LAGS, max(map(len, residuals)) - 1))
         power = sum(float(one @ one) for one in residuals)
         if not lags or power <= count * ROUNDING**2:
             return cls(0.0, True)
@@ -78,11 +78,11 @@ class Correlation(NamedTuple):
             * sum(one**2 / (count - lag) for one, lag in zip(found, lags, strict=True))
         )
         chi2 = imported("scipy.stats", "identification").chi2
-        return cls(found[0], bool(statistic <= chi2.ppf(1 - FALSE_ALARM, len(lags))))
+        return cls(found[0], bool(statistic <= chi2.ppf(1 - _FALSE_ALARM, len(lags))))
 
 
 def memory_of(correlation: float, count: int) -> int:
-    """Choose the lags for ``newey_west``: those for a process of first order.
+    """Choose the lags of ``newey_west`` for a process of first order.
 
     Andrews, "Heteroskedasticity and autocorrelation consistent covariance matrix estimation",
     Econometrica 59 (1991).

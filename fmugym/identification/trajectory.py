@@ -15,7 +15,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = ["Trajectory", "common_names", "named_as_own"]
 
-LONGEST_REPEAT = 5
+_LONGEST_REPEAT = 5
 """Longer runs of equal samples are a plant at rest, not stale samples."""
 
 
@@ -72,7 +72,7 @@ class Trajectory:
         return Trajectory(self.time[rows], outputs, inputs, self.label)
 
     def without_repeats(self) -> Trajectory:
-        """Drop stale samples, whose outputs all equal those of the sample before.
+        """Drop stale samples, whose outputs all equal the outputs of the sample before.
 
         More than five repeats in a row stay, because they show a plant at rest.
         """
@@ -80,7 +80,7 @@ class Trajectory:
         same = np.concatenate([[False], (np.diff(signals, axis=1) == 0).all(axis=0)])
         run = np.cumsum(~same) - 1
         repeats = np.bincount(run) - 1
-        return self.select(~same | (repeats[run] > LONGEST_REPEAT))
+        return self.select(~same | (repeats[run] > _LONGEST_REPEAT))
 
 
 def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[str]]:

@@ -40,14 +40,14 @@ class Cell:
     Args:
         cell_id: The cell's number.
         cell_type: The cell's type.
-        options: What is simulated.
+        options: Options of the simulated cell.
         rng: The random generator of its noise and its friction.
         parameters: Parameters of its FMU that differ from the bundled values.
 
     Attributes:
         cell_id: The cell's number.
         cell_type: The cell's type.
-        options: What is simulated.
+        options: Options of the simulated cell.
         plant: Its FMU and the names of the variables.
         position: True angles, in rad.
         velocity: True angular velocities, in rad/s.

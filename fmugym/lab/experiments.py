@@ -8,14 +8,14 @@ from typing import Final
 
 from fmugym.lab.data import CellType
 
-__all__ = ["EXPERIMENTS", "PLANTS", "Experiment", "Plant"]
+__all__ = ["EXPERIMENTS", "PLANTS", "Experiment", "JointPlant"]
 
 _UNLIMITED_TORQUE: Final = 10.0  # N m; the lab's drive limits the torque, before disturbances
 _UNLIMITED_VELOCITY: Final = 1000.0  # rad/s; the lab ends a session at a lower velocity
 
 
 @dataclass(frozen=True)
-class Plant:
+class JointPlant:
     """An FMU and the names of its variables, joint by joint.
 
     Attributes:
@@ -45,7 +45,7 @@ class Plant:
 
 
 PLANTS: Final = {
-    CellType.SINGLE: Plant(
+    CellType.SINGLE: JointPlant(
         model="Pendulum",
         torques=("tau",),
         positions=("q",),
@@ -55,7 +55,7 @@ PLANTS: Final = {
         coulomb_friction="c",
         joint_names=("pivot",),
     ),
-    CellType.DOUBLE: Plant(
+    CellType.DOUBLE: JointPlant(
         model="DoublePendulum",
         torques=("tau1", "tau2"),
         positions=("q1", "q2"),

@@ -303,7 +303,7 @@ class Lab:
         return self.clock.time()
 
     def _settle(self, now: float) -> None:
-        """Bring everything to the present, sessions before leases, and put aside what has ended."""
+        """Bring sessions and then leases to the present, and put ended ones aside."""
         for booking in sorted(self._running.values(), key=lambda each: isinstance(each, Gym)):
             booking.bring_to(now)
             if booking.ended is not None:
@@ -363,7 +363,7 @@ class Lab:
             raise LabError("user token must be a text that is not empty")
 
     def _check_types(self, kinds: Any) -> None:
-        """Refuse what is no list of cell types, and more cells than the lab has."""
+        """Check a list of cell types, and refuse more cells than the lab has."""
         if not isinstance(kinds, list | tuple) or not kinds:
             raise LabError(f"a gym needs a list of cell types, not {shown(kinds)}")
         if not all(isinstance(kind, CellType) for kind in kinds):

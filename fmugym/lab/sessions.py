@@ -16,7 +16,7 @@ from fmugym.lab.data import LabError, as_lab_error
 
 __all__ = ["Gym", "Session", "entries_of"]
 
-Quantity = Literal["position", "velocity", "torque"]
+_SensorQuantity = Literal["position", "velocity", "torque"]
 
 
 @dataclass(eq=False)
@@ -56,7 +56,7 @@ class Session:
         token: The session or episode token.
         cell: The cell.
         began: When it began, in s of the lab's time.
-        length: How long it may last, in s.
+        length: Length in s.
         gym: The lease of an episode, or None.
         ended: Why it has ended, or None.
         is_stopped: Whether the user has stopped it.
@@ -120,12 +120,12 @@ class Session:
             self.ended = text
             self.cell.park()
 
-    def read(self, quantity: Quantity) -> float | list[float]:
+    def read(self, quantity: _SensorQuantity) -> float | list[float]:
         """Return the newest reading: a float for one actuator, a list for two."""
         values = self.cell.sensors.sample[quantity]
         return values[0] if len(values) == 1 else list(values)
 
-    def command(self, quantity: Quantity, value: Any) -> None:
+    def command(self, quantity: _SensorQuantity, value: Any) -> None:
         """Set a target of the drive or its torque, clamped to the limit as by the local client.
 
         Args:

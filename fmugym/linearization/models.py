@@ -29,7 +29,7 @@ __all__ = ["LinearModel", "linearize"]
 
 logger = logging.getLogger(__name__)
 
-Variables = tuple[Variable, ...]
+_Variables = tuple[Variable, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ def _chosen(
     kind: str,
     names: str | Sequence[str] | None,
     known: Sequence[str],
-) -> Variables:
+) -> _Variables:
     """Look up the chosen variables, or all known ones if none were chosen."""
     names = known if names is None else (names,) if isinstance(names, str) else names
     chosen = tuple(variable for name in names for variable in description.scalars(name))
@@ -191,7 +191,7 @@ def _start_values(
 
 
 def _linear_model(
-    pool: Pool, description: ModelDescription, x: Variables, u: Variables
+    pool: Pool, description: ModelDescription, x: _Variables, u: _Variables
 ) -> LinearModel:
     x_dot = tuple(description.variable(description.state_derivatives[v.name]) for v in x)
     return LinearModel(
@@ -207,5 +207,5 @@ def _linear_model(
     )
 
 
-def _names(variables: Variables) -> tuple[str, ...]:
+def _names(variables: _Variables) -> tuple[str, ...]:
     return tuple(variable.name for variable in variables)

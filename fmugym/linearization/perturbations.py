@@ -1,4 +1,4 @@
-"""Derivatives by the states of an FMU: episodes that start a little beside a trajectory."""
+"""Derivatives by the states of an FMU, from episodes that start beside a trajectory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fmugym.vector.vector_env import FMUVectorEnv
 __all__ = ["Matrices", "differentiate_by_starts"]
 
 _AGREEMENT: Final = 1e-3
-"""By how much a step may differ after a start at the state before it, as a fraction of scales."""
+"""Tolerated difference of a step after a start at the state before it, as a part of scales."""
 
 _LEAST: Final = 1e-3
 """The least magnitude of a state, as a fraction of its nominal value: states at rest have rounding
@@ -73,7 +73,7 @@ def differentiate_by_starts(
 
     Args:
         envs: The environments; they return to their present episodes.
-        start: Of one environment, where the trajectory begins.
+        start: Start of one environment, where the trajectory begins.
         nominal: The actions, shape (horizon, ...).
         states: The start variable of each state.
         steps: How far states and actions are moved, as fractions.
@@ -129,7 +129,7 @@ class _Perturbation:
     def _play_at_any_time(
         self, trials: _Trials, x: FloatArray, scales: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Let the FMU start at the time of each step, or at that of the trajectory.
+        """Start the FMU at the time of each step, or at the time of the trajectory.
 
         The first is right for all FMUs that can start at any time. Others may not depend on it.
         """
@@ -214,7 +214,7 @@ class _Perturbation:
         return trials, widths
 
     def _rounds(self, count: int) -> list[IndexArray]:
-        """Which trials the environments play one after the other."""
+        """Rounds of trials, which the environments play one after the other."""
         num_envs = len(self._everywhere)
         firsts = range(0, count, num_envs)
         return [np.minimum(np.arange(i, i + num_envs), count - 1) for i in firsts]
@@ -244,7 +244,7 @@ class _Perturbation:
         values = np.ascontiguousarray(np.concatenate([fixed, trials.states.T, times]))
         self._pool.reset(self._variables, values, trials.starts)
 
-    # What may be wrong
+    # Checks
 
     def _require_fine(self, what: str, indices: IndexArray) -> None:
         for index in indices[self._pool.statuses[indices] > WARNING_CODE].tolist():
@@ -273,12 +273,12 @@ class _Perturbation:
 
 
 def _slopes(before: FloatArray, after: FloatArray, widths: FloatArray) -> FloatArray:
-    """The differences of pairs of trials, divided by how far they are apart.
+    """Differences of pairs of trials, divided by their distances.
 
     Args:
         before: The states before the step, shape (horizon, 2 (n_x + n_u), n_x); the first n_x pairs
             have moved states.
-        after: What follows, shape (horizon, 2 (n_x + n_u), k).
+        after: Next states, shape (horizon, 2 (n_x + n_u), k).
         widths: How far pairs of actions are apart, shape (horizon, n_u).
 
     Returns:

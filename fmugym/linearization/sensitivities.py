@@ -28,13 +28,13 @@ __all__ = [
 
 
 class Derivatives(NamedTuple):
-    """How a trajectory changes with its actions.
+    """Derivatives of a trajectory by its actions.
 
     The derivative by an action of a later step is 0.
 
     Attributes:
-        observations: Of the nominal actions, shape (horizon, outputs).
-        rewards: Of the nominal actions, shape (horizon,).
+        observations: Observations of the nominal actions, shape (horizon, outputs).
+        rewards: Rewards of the nominal actions, shape (horizon,).
         by_actions: Derivatives of the observations, shape (horizon, outputs, horizon, actions):
             element [t, i, s, j] is that of observation i after step t by action j of step s.
         of_rewards: Derivatives of the rewards, shape (horizon, horizon, actions).
@@ -63,7 +63,7 @@ def derivatives(
 
     Args:
         envs: Environments whose observations and actions are boxes of floats, of any shape.
-        snapshot: Of one environment, where the trajectory begins.
+        snapshot: Snapshot of one environment, where the trajectory begins.
         actions: The nominal actions, shape (horizon, ...).
         step: How far actions are moved, as a fraction of the width of the space, or absolute where
             it has no bounds; by default the cube root of the precision of the observations.
@@ -136,7 +136,7 @@ def checked_trajectory(space: spaces.Box, actions: Any) -> npt.NDArray[Any]:
 
 
 def require_vector(envs: Any, name: str) -> None:
-    """Refuse what is no open vector environment.
+    """Require an open vector environment.
 
     Raises:
         ConfigError: If it is something else.
@@ -150,7 +150,7 @@ def require_vector(envs: Any, name: str) -> None:
 def moved_alone(
     space: spaces.Box, nominal: npt.NDArray[Any], step: float
 ) -> tuple[npt.NDArray[Any], FloatArray]:
-    """The nominal actions, then two candidates for each element; and how far these are apart."""
+    """Nominal actions, two candidates for each element, and the distances of these."""
     *moved, widths = moved_both_ways(space, nominal, step)
     candidates = np.repeat(nominal[None], 2 * nominal.size + 1, axis=0)
     flat = candidates.reshape(len(candidates), -1)
@@ -166,7 +166,7 @@ def moved_both_ways(
     """Move each element of actions up and down, and not beyond the bounds of the space.
 
     Args:
-        space: That of one action.
+        space: Space of one action.
         nominal: Shape (horizon, ...).
         step: How far, as a fraction of the width of the space.
 
@@ -185,10 +185,10 @@ def moved_both_ways(
 
 
 def differences(values: npt.NDArray[Any], widths: FloatArray) -> FloatArray:
-    """The differences of each pair of candidates, divided by how far they are apart.
+    """Differences of each pair of candidates, divided by their distances.
 
     Args:
-        values: What the candidates of ``moved_alone`` lead to, in their order.
+        values: Results of the candidates of ``moved_alone``, in their order.
         widths: How far they are apart.
     """
     pairs = values[1:].reshape(len(widths), 2, *values.shape[1:])

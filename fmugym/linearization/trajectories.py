@@ -1,4 +1,4 @@
-"""Linear models along a trajectory: how each step depends on the state before it and the action."""
+"""Linear models along a trajectory, from the state and the action to the next state."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = ["LinearTrajectory", "linearize_along"]
 logger = logging.getLogger(__name__)
 
 _BESIDE: Final = 1e-3
-"""How far actions are moved to check derivatives, as a fraction of the width of their space."""
+"""Distance of the actions that check derivatives, as a part of the width of their space."""
 
 _ROUNDING: Final = 1e-9
 """Changes of states that are smaller fractions of these show rounding errors."""
@@ -110,7 +110,7 @@ def linearize_along(
     Args:
         envs: The environments; their actions are in a box of floats. They return to their present
             episodes afterwards.
-        snapshot: Of one environment, where the trajectory begins.
+        snapshot: Snapshot of one environment, where the trajectory begins.
         actions: The nominal actions, shape (horizon, ...).
         states: Names of states; or the name of the start variable of each, such as
             ``{"q": "q_0"}``, where that is another one. The name of an array stands for its
@@ -149,7 +149,7 @@ def linearize_along(
 
 
 def _fractions(step: float | None, space: spaces.Box) -> tuple[float, float]:
-    """How far states and actions are moved."""
+    """Fractions by which states and actions are moved."""
     if step is not None:
         check_number("step", step, positive=True)
         return step, step
@@ -283,7 +283,7 @@ class _Follower:
         return Matrices(a, b @ by_actions, by_x @ a, d, np.array(x), np.array(y))
 
     def error_beside(self, nominal: npt.NDArray[Any], found: Matrices) -> float:
-        """Play other actions, and compare the change of each step with what matrices predict.
+        """Play other actions, and compare the change of each step with the linear prediction.
 
         Returns:
             The mean error of a state, as a fraction of its largest change; that of the worst state.
@@ -348,7 +348,7 @@ def _require_no_feedback(env: FMUEnv, action: npt.NDArray[Any]) -> None:
 
 
 def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
-    """Differentiate the FMU's inputs by an action, and leave those of the action in the pool.
+    """Differentiate the FMU's inputs by an action; the action's inputs stay in the pool.
 
     Returns:
         Shape (inputs, actions).

@@ -1,4 +1,4 @@
-"""Plants: an agent in the shadow of one, and an FMU that is one.
+"""Plants: agents that follow a plant as its shadow, and FMUs served as plants.
 
 ::
 

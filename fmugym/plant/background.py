@@ -8,21 +8,21 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import Any, Final
 
-__all__ = ["Background"]
+__all__ = ["BackgroundLoop"]
 
 _JOIN_SECONDS: Final = 0.1
-"""How long to wait for the effect of a cancellation, in seconds."""
+"""Time to wait for the effect of a cancellation, in seconds."""
 
 
-class Background:
+class BackgroundLoop:
     """Runs a coroutine in a thread until it ends, or is stopped.
 
     Args:
         make: Makes the coroutine.
-        name: Of the thread.
+        name: Name of the thread.
 
     Attributes:
-        error: What the coroutine has raised, or None.
+        error: Exception of the coroutine, or None.
     """
 
     def __init__(self, make: Callable[[], Coroutine[Any, Any, None]], name: str) -> None:

@@ -1,4 +1,4 @@
-"""What holds at the ticks of a plant: a backend that waits, reads, and writes nothing."""
+"""Feed of a plant: a read-only backend that waits for ticks and reads the tags."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _LEAST_JUMP: Final = 60.0
 """Clocks that are apart by less, in seconds, have not jumped."""
 
 _LATE: Final = 2.0
-"""How late a thread or an answer may be, in seconds of real time."""
+"""Tolerated lateness of a thread or an answer, in seconds of real time."""
 
 
 def _time_of_year(now: datetime.datetime, offset: int | None) -> float:
-    """The seconds since the beginning of the year, on a standard time or that of this place."""
+    """Seconds since the beginning of the year, on a standard time or local time."""
     zone = None if offset is None else datetime.timezone(datetime.timedelta(seconds=offset))
     return moment_of_year(now.astimezone(zone))
 
@@ -50,7 +50,7 @@ class Feed:
     Attributes:
         plant: Has the tags; whoever makes the environment sets it.
         values: The present values of the tags, in the task's units.
-        faults: What is wrong, by the names of tags whose last value goes on.
+        faults: Faults by the names of tags whose last value goes on.
         has_expired: Whether the last value of one has held for too long.
         time: The plant's time at the present tick.
         jump: By how much the plant's time has jumped, in seconds.
@@ -77,7 +77,7 @@ class Feed:
         self._ahead, self._has_begun = 0.0, False
 
     def row(self) -> dict[str, float]:
-        """What the FMU's variables have at this tick, in its units, by name."""
+        """Values of the FMU's variables at this tick, in its units, by name."""
         return {
             tag.own: tag.to_task.inverse(self.values[name][0])
             for name, tag in self.plant.tags.items()
@@ -89,7 +89,7 @@ class Feed:
         return [tag.own for name, tag in self.plant.tags.items() if name in self.faults]
 
     def told(self) -> str:
-        """What is wrong, in words; tags of which the same is wrong stand together."""
+        """Describe all faults; tags with the same fault stand together."""
         names: dict[str, list[str]] = {}
         for name, why in self.faults.items():
             names.setdefault(why, []).append(name)
@@ -161,7 +161,7 @@ class Feed:
             raise ConfigError(self._told())
 
     def advance(self) -> None:
-        """Wait for the next tick; what was read until then becomes present."""
+        """Wait for the next tick, and take the answers until then."""
         self.time += self.plant.step
         self._sleep()
         off = self._seen_ahead() - self._ahead
@@ -179,7 +179,7 @@ class Feed:
         self.has_expired |= bool(faults)
 
     def _seen_ahead(self) -> float:
-        """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
+        """Time by which the plant's clock is ahead, by the latest answer, at the most."""
         if "clock" in self._asked:
             return self.values["clock"][0] - self._asked["clock"]
         if speed_of(self.clock) == 1.0:
@@ -190,7 +190,7 @@ class Feed:
         )  # a clock that runs faster began with the time of this place
 
     def _look(self, begin: float, end: float) -> None:
-        """Find out what holds at the end of a step."""
+        """Find the values at the end of a step."""
         self.faults, self.has_expired = {}, False
         rounds = self._poller.take(end)
         for name, asked in self._asked.items():
@@ -208,7 +208,7 @@ class Feed:
                 self.has_expired = True
 
     def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
-        """What a step gives of its readings, a row for each."""
+        """Sampled values of a step, a row for each reading."""
         how = self.plant.tags[name].sampling
         found = _SAMPLED[how](numbers, axis=0) * (self.plant.step if how == "integral" else 1.0)
         return tuple(found.tolist())

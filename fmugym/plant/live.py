@@ -1,4 +1,4 @@
-"""Data of a task that a plant, or a file that something else refreshes, tells while it runs."""
+"""Live data of a task, which a plant or a refreshed file tells while an episode runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.spelling import as_declared
 from fmugym.errors import ConfigError, shown
 from fmugym.logs import declared_as
-from fmugym.plant.tags import DATA, Plant
+from fmugym.plant.tags import DATA_PREFIX, Plant
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Live", "forecasts", "horizon"]
@@ -63,7 +63,7 @@ class Live:
                 )
 
     def refresh(self, now: float, tags: dict[str, tuple[float, ...]]) -> dict[str, str]:
-        """Let environments look up what is known now.
+        """Let environments look up the data that are known now.
 
         Args:
             now: The plant's time, in seconds of the year.
@@ -77,7 +77,7 @@ class Live:
             try:
                 rows = self._rows(name, entry, now, tags)
             except ConfigError as error:
-                faults[DATA + name] = str(error)
+                faults[DATA_PREFIX + name] = str(error)
             else:
                 self._write(name, *rows)
         return faults
@@ -87,7 +87,7 @@ class Live:
     ) -> tuple[FloatArray, FloatArray]:
         """Times from now on, in seconds of the year, and the values in the unit of the data."""
         if "file" not in entry.value:
-            values = np.array(tags[DATA + name])
+            values = np.array(tags[DATA_PREFIX + name])
             return now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values
         rows = read_rows(entry, self._standard)
         with entry.placing():
@@ -136,7 +136,7 @@ def _relative(env: Any, names: Iterable[str]) -> Iterator[str]:
 
 
 def horizon(root: Entry, name: str) -> float:
-    """How far ahead the agent sees some data, in seconds."""
+    """Largest forecast horizon of some data, in seconds."""
     return max((float(one["horizon"]) for one in forecasts(root, name)), default=0.0)
 
 

@@ -1,4 +1,4 @@
-"""Modbus TCP: a client that only reads, and a server that nobody writes to."""
+"""Modbus TCP: a client that only reads, and a server that cannot be written to."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
 
 from fmugym.errors import ConfigError, shown
-from fmugym.plant.polling import Answer, LostError, Values
+from fmugym.plant.polling import ConnectionLostError, TagReading, Values
 from fmugym.plant.tags import Plant, Tag
 
-__all__ = ["PlantClient", "serve"]
+__all__ = ["ModbusClient", "serve_modbus"]
 
 _PORT: Final = 502
-"""That of Modbus TCP, where an address has none."""
+"""Port of Modbus TCP for addresses without one."""
 
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
@@ -32,13 +32,13 @@ _KINDS: Final = {
     "holding": (3, "read_holding_registers"),
     "input": (4, "read_input_registers"),
 }
-"""The functions that read, by what they read: their codes, and the library's names."""
+"""Functions that read coils and registers: their codes, and the library's names."""
 
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
 
 
 class _Place(NamedTuple):
-    """Where a tag is: registers or bits of a device, from the first one to before the end."""
+    """Place of a tag: registers or bits of a device, from the first to before the end."""
 
     unit_id: int
     kind: str
@@ -63,14 +63,14 @@ def _type(tag: Tag) -> Any:
     return AsyncModbusTcpClient.DATATYPE[tag.address["type"].upper()]
 
 
-def _answer(place: _Place, cells: Sequence[Any]) -> Answer:
-    """The numbers in registers or bits; devices write NaN for what they do not know."""
+def _answer(place: _Place, cells: Sequence[Any]) -> TagReading:
+    """Numbers in registers or bits; devices write NaN for unknown values."""
     found: Any = cells
     tag = place.tag
     if not place.is_bits:
         order = tag.address["word_order"]
         found = AsyncModbusTcpClient.convert_from_registers(cells, _type(tag), order)
-    return Answer.of(tag, f"{place.kind} {place.begin}", [*np.ravel(found)])
+    return TagReading.of(tag, f"{place.kind} {place.begin}", [*np.ravel(found)])
 
 
 def _cells(place: _Place, values: Sequence[float]) -> Sequence[int]:
@@ -89,7 +89,7 @@ def _cells(place: _Place, values: Sequence[float]) -> Sequence[int]:
 
 
 def _places(plant: Plant) -> list[_Place]:
-    """Those of all tags, in their order."""
+    """Places of all tags, in their order."""
     found = [_Place.of(plant, tag) for tag in plant.tags.values()]
     return sorted(found, key=lambda one: one[:4])
 
@@ -106,8 +106,8 @@ def _neighbours(places: Sequence[_Place]) -> list[list[_Place]]:
     return found
 
 
-class PlantClient:
-    """Reads the tags of a plant; see ``polling.Client``."""
+class ModbusClient:
+    """Reads the tags of a plant; see ``TagClient``."""
 
     def __init__(self, plant: Plant) -> None:
         self._host, self._port = _host_and_port(plant.address)
@@ -116,19 +116,19 @@ class PlantClient:
 
     @asynccontextmanager
     async def connected(self) -> AsyncIterator[None]:
-        """See ``polling.Client``."""
+        """See ``TagClient``."""
         options = {"timeout": self._timeout, "retries": 0, "reconnect_delay": 0}
         self._client = AsyncModbusTcpClient(self._host, port=self._port, **options)
         try:
             if not await self._client.connect():
-                raise LostError("it refuses the connection, or does not answer")
+                raise ConnectionLostError("it refuses the connection, or does not answer")
             yield
         finally:
             self._client.close()
 
-    async def read(self) -> dict[str, Answer]:
-        """See ``polling.Client``."""
-        found: dict[str, Answer] = {}
+    async def read(self) -> dict[str, TagReading]:
+        """See ``TagClient``."""
+        found: dict[str, TagReading] = {}
         for block in self._blocks:
             begin = block[0].begin
             whole, fault = await self._ask(block[0]._replace(end=block[-1].end))
@@ -136,14 +136,14 @@ class PlantClient:
                 cells, why = whole[one.begin - begin : one.end - begin], fault
                 if fault and len(block) > 1:  # another one may be the reason
                     cells, why = await self._ask(one)
-                found[one.tag.name] = Answer((), why) if why else _answer(one, cells)
+                found[one.tag.name] = TagReading((), why) if why else _answer(one, cells)
         return found
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
-        """The registers or bits, and what the server says instead."""
+        """Ask for registers or bits; returns them, and the fault that the server tells."""
         ask = getattr(self._client, _KINDS[place.kind][1])
         if not self._client.connected:
-            raise LostError("the connection is lost")
+            raise ConnectionLostError("the connection is lost")
         cells: list[Any] = []
         for begin in range(place.begin, place.end, _MOST):
             count = min(_MOST, place.end - begin)
@@ -170,7 +170,7 @@ def _host_and_port(address: str) -> tuple[str, int]:
 
 
 @asynccontextmanager
-async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
+async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback.
 
     Args:
@@ -196,7 +196,7 @@ async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
 
 
 class _Registers(NamedTuple):
-    """Where a server finds registers and bits: it makes them of the values of now."""
+    """Registers and bits of a server, made of the present values."""
 
     places: Sequence[_Place]
     values: Values
@@ -204,7 +204,7 @@ class _Registers(NamedTuple):
     # The library gives these methods their names.
 
     async def async_getValues(self, unit_id: int, code: int, begin: int, count: int) -> Any:  # noqa: N802
-        """The cells from some place on; those between tags are 0."""
+        """Cells from an address on; cells between tags are 0."""
         found: dict[int, int] = {}
         now = self.values()
         for one in self.places:
@@ -216,5 +216,5 @@ class _Registers(NamedTuple):
         return [found.get(place, 0) for place in range(begin, begin + count)]
 
     async def async_setValues(self, *_: Any) -> Any:  # noqa: N802
-        """Refuse who writes."""
+        """Refuse to be written."""
         return ExcCodes.ILLEGAL_FUNCTION

@@ -1,4 +1,4 @@
-"""OPC UA: a client that only reads, and a server that nobody writes to."""
+"""OPC UA: a client that only reads, and a server that cannot be written to."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from cryptography import x509
 
 from fmugym.checks import check_path, require_regular
 from fmugym.errors import ConfigError, shown
-from fmugym.plant.polling import Answer, CertificateError, Values
+from fmugym.plant.polling import CertificateError, TagReading, Values
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
 
-__all__ = ["PlantClient", "serve"]
+__all__ = ["OPCUAClient", "serve_opcua"]
 
 logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
 
-class PlantClient:
-    """Reads the tags of a plant; see ``polling.Client``."""
+class OPCUAClient:
+    """Reads the tags of a plant; see ``TagClient``."""
 
     def __init__(self, plant: Plant) -> None:
         self._plant, self._tags = plant, list(plant.tags.values())
@@ -44,7 +44,7 @@ class PlantClient:
 
     @asynccontextmanager
     async def connected(self) -> AsyncIterator[None]:
-        """See ``polling.Client``."""
+        """See ``TagClient``."""
         self._client = Client(self._address, timeout=self._plant["timeout"])
         if self._user is not None:
             self._client.set_user(self._user[0])
@@ -72,25 +72,25 @@ class PlantClient:
             SecurityPolicyBasic256Sha256, _content(certificate), _content(key)
         )
 
-    async def read(self) -> dict[str, Answer]:
-        """See ``polling.Client``."""
+    async def read(self) -> dict[str, TagReading]:
+        """See ``TagClient``."""
         read = self._client.uaclient.read_attributes
         told = await read(self._nodes, ua.AttributeIds.Value)
         pairs = zip(self._tags, told, strict=True)
         return {tag.name: self._answer(tag, one) for tag, one in pairs}
 
     @staticmethod
-    def _answer(tag: Tag, told: Any) -> Answer:
+    def _answer(tag: Tag, told: Any) -> TagReading:
         node, status = tag.address["node"], told.StatusCode
         if status is not None and not status.is_good():
-            return Answer((), f"node {node}: {status.name}")
+            return TagReading((), f"node {node}: {status.name}")
         value = None if told.Value is None else told.Value.Value
         numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value]
         if not all(isinstance(one, bool | int | float) for one in numbers):
-            return Answer((), f"node {node}: expected a number, got {shown(value)}")
+            return TagReading((), f"node {node}: expected a number, got {shown(value)}")
         if len(numbers) != tag.count:
-            return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
-        return Answer.of(tag, f"node {node}", numbers)
+            return TagReading((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
+        return TagReading.of(tag, f"node {node}", numbers)
 
 
 def _node_id(tag: Tag) -> Any:
@@ -121,7 +121,7 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
 async def _only(
     path: str, refusal: Callable[[], Exception]
 ) -> Callable[[Any, Any], Awaitable[None]]:
-    """What takes the certificate in a file, and raises an error at all others."""
+    """Make a validator that accepts only the certificate in a file."""
     known = await _certificate_in(Path(path))
 
     async def validate(certificate: Any, description: Any) -> None:
@@ -132,7 +132,7 @@ async def _only(
 
 
 def _content(path: Path) -> Any:
-    """What a file has, read at once: the library leaves files open when a poller is stopped."""
+    """Content of a file, read at once: the library leaves files open when a poller is stopped."""
     require_regular(path)
     return CertProperties(path.read_bytes(), path.suffix.removeprefix("."))
 
@@ -146,8 +146,8 @@ async def _certificate_in(path: Path) -> Any:
 
 
 @asynccontextmanager
-async def serve(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
-    """Serve tags on the loopback; see ``modbus.serve``.
+async def serve_opcua(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
+    """Serve tags on the loopback; see ``serve_modbus``.
 
     Where the plant encrypts, the server makes a certificate of its own. It takes no other client
     than the one whose certificate the plant names, if it names one.

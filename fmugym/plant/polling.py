@@ -1,4 +1,4 @@
-"""What a client of a protocol offers, and the thread that asks it again and again."""
+"""Poller of tags: the interface of clients, and the thread that asks them periodically."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from fmugym.errors import FMUGymError
 from fmugym.extras import imported
-from fmugym.plant.background import Background
+from fmugym.plant.background import BackgroundLoop
 from fmugym.plant.tags import Plant, Tag
 from fmugym.pool.backend.clocks import Clock, speed_of
 
 __all__ = [
-    "Answer",
     "CertificateError",
-    "Client",
-    "LostError",
+    "ConnectionLostError",
+    "PlantProtocol",
     "Poller",
     "Round",
+    "TagClient",
+    "TagReading",
     "Values",
     "protocol_of",
 ]
@@ -36,27 +37,27 @@ _REFUSALS: Final = ("Certificate", "Security", "Identity", "UserAccess")
 """Words in the names of errors of a server that refuses a client, or is refused."""
 
 
-class LostError(FMUGymError):
+class ConnectionLostError(FMUGymError):
     """The server is not there, or does not answer."""
 
 
-class CertificateError(LostError):
+class CertificateError(ConnectionLostError):
     """This client does not want the server."""
 
 
-class Answer(NamedTuple):
-    """What a server says of a tag.
+class TagReading(NamedTuple):
+    """Answer of a server about a tag.
 
     Attributes:
         numbers: In the unit of the task.
-        fault: What is wrong with them; "" if they are good.
+        fault: Fault of the numbers; "" for good ones.
     """
 
     numbers: tuple[float, ...]
     fault: str = ""
 
     @classmethod
-    def of(cls, tag: Tag, where: str, numbers: Sequence[float]) -> Answer:
+    def of(cls, tag: Tag, where: str, numbers: Sequence[float]) -> TagReading:
         """The numbers of a plant in the unit of the task, if they are finite."""
         if not all(map(math.isfinite, numbers)):
             return cls((), f"{where} has no finite number")
@@ -67,20 +68,11 @@ class Round(NamedTuple):
     """The answers for all tags, and when they were asked for: they are no older."""
 
     asked: float
-    answers: dict[str, Answer]
+    answers: dict[str, TagReading]
 
 
-def protocol_of(plant: Plant) -> Any:
-    """The module of a plant's protocol, which has a ``PlantClient`` and ``serve``.
-
-    Raises:
-        ConfigError: If the extra ``plant`` is missing.
-    """
-    return imported(f"fmugym.plant.{plant['protocol']}", "plant")
-
-
-class Client(Protocol):
-    """Reads from a server. It has no method that writes."""
+class TagClient(Protocol):
+    """Interface of a client, which reads from a server and has no method that writes."""
 
     def connected(self) -> AbstractAsyncContextManager[None]:
         """Connect, and disconnect in the end, whatever has happened before.
@@ -89,12 +81,31 @@ class Client(Protocol):
             Exception: If it cannot connect.
         """
 
-    async def read(self) -> dict[str, Answer]:
+    async def read(self) -> dict[str, TagReading]:
         """Read all tags.
 
         Raises:
             Exception: If the server does not answer.
         """
+
+
+class PlantProtocol(NamedTuple):
+    """The client of a protocol, and the server of the tags of a simulated plant."""
+
+    client: Callable[[Plant], TagClient]
+    serve: Callable[[Plant, int, Values], AbstractAsyncContextManager[str]]
+
+
+def protocol_of(plant: Plant) -> PlantProtocol:
+    """Import the protocol of a plant.
+
+    Raises:
+        ConfigError: If the extra ``plant`` is missing.
+    """
+    module: Any = imported(f"fmugym.plant.{plant['protocol']}", "plant")
+    if plant["protocol"] == "modbus":
+        return PlantProtocol(module.ModbusClient, module.serve_modbus)
+    return PlantProtocol(module.OPCUAClient, module.serve_opcua)
 
 
 class Poller:
@@ -111,14 +122,14 @@ class Poller:
         is_refused: Whether this client was refused when it last connected.
     """
 
-    def __init__(self, client: Client, clock: Clock, interval: float, timeout: float) -> None:
+    def __init__(self, client: TagClient, clock: Clock, interval: float, timeout: float) -> None:
         self._client, self._clock, self._timeout = client, clock, timeout
         self._interval, self._speed = interval, speed_of(clock)
         self._rounds: deque[Round] = deque(maxlen=_MOST)
         self._trouble = "it has not answered yet"
-        self.answers: dict[str, Answer] = {}
+        self.answers: dict[str, TagReading] = {}
         self.is_refused = False
-        self._background = Background(self._poll, "plant")
+        self._background = BackgroundLoop(self._poll, "plant")
 
     async def _poll(self) -> None:
         while True:
@@ -135,7 +146,7 @@ class Poller:
         name = type(error).__name__
         self.is_refused = any(word in name for word in _REFUSALS)
         what = "it refuses this client" if self.is_refused else "it does not answer"
-        is_own = isinstance(error, LostError)
+        is_own = isinstance(error, ConnectionLostError)
         self._trouble = str(error) if is_own else f"{what}: {name} {error}".strip()
 
     async def _converse(self, connection: AsyncExitStack) -> None:
@@ -158,7 +169,7 @@ class Poller:
         return found
 
     def trouble(self, name: str) -> str:
-        """What is wrong with a tag now; "" if nothing is."""
+        """Present fault of a tag; "" for none."""
         return self._trouble or (self.answers[name].fault if self.answers else "")
 
     def stop(self) -> None:

@@ -1,4 +1,4 @@
-"""What a copy of the FMU foretells of a plant, and how wrong that is."""
+"""Predictions of a plant by copies of its FMU, and their errors."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fmugym.baselines.observer import COPIES, Observer, spread
+from fmugym.baselines.observer import COPIES, Observer, parameters_of_copies
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.written import Written
+from fmugym.plant.plant_actions import PlantActions
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Error", "Predictions"]
@@ -54,9 +54,9 @@ class Predictions:
     def __init__(self, make_env: Callable[[], TaskEnv], feed: Feed, steps: int) -> None:
         self._feed = feed
         self.envs = [make_env()] if steps else []
-        self._spread = spread(self.envs[0], 0) if steps else {}
+        self._spread = parameters_of_copies(self.envs[0], 0) if steps else {}
         self.envs += [make_env() for _ in range(COPIES - 1 if self._spread else 0)]
-        self._written = [Written(env, feed) for env in self.envs]
+        self._written = [PlantActions(env, feed) for env in self.envs]
         self._tags = feed.plant.of(self.envs[0].pool_spec.outputs) if steps else []
         self.names = [tag.name for tag in self._tags]
         # of the errors, by horizon and variable: how many, their sum, and that of their squares
@@ -67,7 +67,7 @@ class Predictions:
         return np.array([self._feed.values[name][0] for name in self.names])
 
     def _seen(self) -> FloatArray:
-        """What the copies give, shape (n, k)."""
+        """Outputs of the copies, shape (n, k)."""
         return np.array([[tag.of_fmu(env.out) for tag in self._tags] for env in self.envs])
 
     def begin(self) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Names and passwords, which no task file has."""
+"""User names and passwords, which do not stand in task files."""
 
 from __future__ import annotations
 

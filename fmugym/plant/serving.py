@@ -1,4 +1,4 @@
-"""An FMU as a plant: what a server of the loopback tells of it."""
+"""Server of a simulated plant: an FMU whose values are the tags of a server on the loopback."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from fmugym.declared.format import DEVICE
 from fmugym.declared.series import Series, read_data
 from fmugym.episodes.simulation import Player, Policy, Summary, action_of, policy_of
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
-from fmugym.plant.background import Background
+from fmugym.plant.background import BackgroundLoop
 from fmugym.plant.polling import protocol_of
-from fmugym.plant.tags import DATA, Plant, Tag, read_plant
+from fmugym.plant.tags import DATA_PREFIX, Plant, Tag, read_plant
 from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 
 __all__ = ["Server", "endless", "environment"]
@@ -54,7 +54,7 @@ class _Twin:
         plant: Has the tags.
         policy: Acts.
         clock: Tells the time.
-        seed: Of the episode.
+        seed: Seed of the episode.
         most: How many steps it has.
     """
 
@@ -79,7 +79,7 @@ class _Twin:
         self._advance()
 
     def _places_of_sensors(self) -> dict[str, int]:
-        """Where in the observation is what sensors show, by name."""
+        """Places of sensor readings in the observation, by name."""
         names = self.env.observation_names or ()
         if "normalize" in self.env.unphysical_keys:
             return {}
@@ -109,17 +109,17 @@ class _Twin:
         self._steps += 1
 
     def summary(self) -> Summary:
-        """What was reached until now."""
+        """Results until now."""
         seconds = self._steps * self.plant.step
         return Summary(self.seed, self._steps, seconds, self._reward, self._cost, "stopped")
 
     @property
     def passed(self) -> float:
-        """How many steps have passed, with a part of one."""
+        """Number of passed steps, with the fraction of the present one."""
         return min((self.clock.time() - self._begin) / self.plant.step, self.most)
 
     def values(self) -> dict[str, tuple[float, ...]]:
-        """What all tags have now."""
+        """Present values of all tags."""
         passed = self.passed
         while self._steps <= passed and self._steps < self.most:
             self._advance()
@@ -128,10 +128,10 @@ class _Twin:
         return {name: self._of_tag(tag, part, time) for name, tag in self.plant.tags.items()}
 
     def _of_tag(self, tag: Tag, part: float, time: float) -> tuple[float, ...]:
-        """What a tag has when some part of a step has passed."""
-        if tag.name.startswith(DATA):
+        """Values of a tag at a fraction of a step."""
+        if tag.name.startswith(DATA_PREFIX):
             ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
-            series = self._data[tag.name.removeprefix(DATA)]
+            series = self._data[tag.name.removeprefix(DATA_PREFIX)]
             own = series.files[int(self.env.variables.get(series.variable, 0))]
             return tuple(_at(own, time + ahead).tolist())
         if tag.name == "clock":
@@ -164,14 +164,14 @@ class Server:
 
     Args:
         config: The task, as for ``fmugym.load``.
-        player: Who acts; or ``"random"``, or a controller as in a task file.
+        player: Player; or ``"random"``, or a controller as in a task file.
         port: The port; 0 for a free one.
         clock: Tells the time; by default that of the machine.
-        seed: Of the episode.
+        seed: Seed of the episode.
         steps: How many steps to serve; None for no end.
 
     Attributes:
-        address: Where it is served, as ``connect`` takes it.
+        address: Address of the server, as ``connect`` takes it.
         summary: Returns what was reached until now.
 
     Raises:
@@ -194,7 +194,7 @@ class Server:
         self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
         self.address = ""
         self.summary: Callable[[], Summary]
-        self._background = Background(self._serve, "plant server")
+        self._background = BackgroundLoop(self._serve, "plant server")
         while not (self.address or self.wait(0.01)):
             pass
 

@@ -17,11 +17,11 @@ from fmugym.export.imperfections import ideal
 from fmugym.logs import on_time_of_year
 from fmugym.plant.feed import Feed
 from fmugym.plant.live import Live
+from fmugym.plant.plant_actions import PlantActions
 from fmugym.plant.polling import Poller, protocol_of
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
-from fmugym.plant.tags import DATA, read_plant
-from fmugym.plant.written import Written
+from fmugym.plant.tags import DATA_PREFIX, read_plant
 from fmugym.pool.backend.clocks import Clock, RealClock
 
 __all__ = ["Shadow", "connect"]
@@ -60,7 +60,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(
-        self, env: TaskEnv, feed: Feed, written: Written, copies: Predictions, owned: ExitStack
+        self, env: TaskEnv, feed: Feed, written: PlantActions, copies: Predictions, owned: ExitStack
     ) -> None:
         super().__init__(env)
         self._feed, self._written, self._owned = feed, written, owned
@@ -92,7 +92,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
     def _told(self, predicted: dict[str, float]) -> dict[str, Any]:
-        missing = tuple(name.removeprefix(DATA) for name in self._feed.faults)
+        missing = tuple(name.removeprefix(DATA_PREFIX) for name in self._feed.faults)
         info = {"proposed": self._proposed, "predicted": predicted, "missing": missing}
         fault = self._feed.told()
         return info | ({"fault": fault} if fault else {})
@@ -136,7 +136,7 @@ def connect(
     with ExitStack() as stack:
         env = stack.enter_context(closing(environment(own, backend=feed)))
         feed.plant = plant = read_plant(env, address)
-        written = Written(env, feed)
+        written = PlantActions(env, feed)
         for output in env.pool_spec.outputs:
             plant.require(output)
         env.held_outputs = feed.held  # type: ignore[method-assign]  # of this environment
@@ -148,7 +148,7 @@ def connect(
             int(ahead / plant.step + 1e-9),
         )
         live = Live([env, *copies.envs], plant)
-        client = protocol_of(plant).PlantClient(plant)
+        client = protocol_of(plant).client(plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
         feed.open(poller, live)

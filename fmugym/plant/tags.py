@@ -1,4 +1,4 @@
-"""Where a plant has the variables of a task."""
+"""Tags: the places of a task's variables on the server of a plant."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from fmugym.declared.standard_time import standard_time
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.logs import declared_as
 
-__all__ = ["DATA", "Plant", "Tag", "read_plant"]
+__all__ = ["DATA_PREFIX", "Plant", "Tag", "read_plant"]
 
-DATA = "data."
-"""What the names of tags of live data begin with."""
+DATA_PREFIX = "data."
+"""Beginning of the names of tags of live data."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Tag:
 
     Attributes:
         name: The name in the task.
-        entry: Where it is declared.
+        entry: Entry of the task.
         address: The keys of its address.
         conversion: From the plant's number to the unit of the task.
         count: How many numbers there are.
@@ -54,7 +54,7 @@ class Tag:
         return self.to_task(values[self.own])
 
     def misfit(self, number: float) -> str:
-        """What is strange about a number, which a wrong type would make; "" if nothing is."""
+        """Describe a number that a wrong type would make; "" for a plausible one."""
         width = self.high - self.low
         if math.isinf(width) or self.low - width <= number <= self.high + width:
             return ""
@@ -69,10 +69,10 @@ class Plant:
     """The section ``[plant]`` of a task.
 
     Attributes:
-        entry: Where it stands.
-        address: That of the server.
+        entry: Entry of the task.
+        address: Address of the server.
         tags: By name.
-        data: Where data come from while it runs, by their names in the task.
+        data: Sources of live data, by their names in the task.
         step: The time step of the task in seconds.
         poll, stale_after, hold: In seconds.
         standard: The offset of the task's standard time in seconds east of UTC; None if nothing
@@ -130,7 +130,7 @@ def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
 
 
 def _data(env: TaskEnv, entry: Entry) -> dict[str, Entry]:
-    """Where data come from while the plant runs, by their names in the task."""
+    """Sources of live data, by their names in the task."""
     spellings = Spellings("data", env.task.document.get("data", {}))
     given = entry.child("data").items()
 
@@ -159,11 +159,13 @@ def _tags(env: TaskEnv, entry: Entry, data: Mapping[str, Entry]) -> Iterator[Tag
         yield _tag(env, "clock", entry.child("clock"), "s")
     for name, one in data.items():
         if "file" not in one.value:
-            yield _tag(env, DATA + name, one, env.task.document["data"][name].get("unit", ""))
+            yield _tag(
+                env, DATA_PREFIX + name, one, env.task.document["data"][name].get("unit", "")
+            )
 
 
 def _in_fmu(env: TaskEnv, name: str) -> dict[str, Any]:
-    """What a tag says of the variable of the FMU, if the task writes or reads one by this name."""
+    """Conversion from a tag to the FMU's variable of this name, if the task uses it."""
     own, unit = declared_as(env, name)
     spec = env.pool_spec
     for one in (*spec.outputs, *spec.inputs):

@@ -24,7 +24,7 @@ __all__ = [
     "surrogate_state",
 ]
 
-FloatArray = npt.NDArray[np.float64]
+_FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
 
 _HEAD: Final = struct.Struct("<qqdqq")
@@ -81,18 +81,18 @@ def head_of(state: bytes) -> Head:
     return Head(*_HEAD.unpack_from(state))
 
 
-def outputs_of(state: bytes, count: int) -> tuple[FloatArray, bytes]:
+def outputs_of(state: bytes, count: int) -> tuple[_FloatArray, bytes]:
     """Read the outputs of a state, so many of them, and what follows."""
     end = _HEAD.size + 8 * count
     return np.frombuffer(state[_HEAD.size : end]), state[end:]
 
 
-def ended_state(start_time: float, outputs: FloatArray) -> bytes:
+def ended_state(start_time: float, outputs: _FloatArray) -> bytes:
     """The state of an instance that is lost, and could not be stepped any more."""
     return _HEAD.pack(_ENDED, 0, start_time, 0, 0) + outputs.tobytes()
 
 
-def surrogate_state(outputs: FloatArray, content: bytes) -> bytes:
+def surrogate_state(outputs: _FloatArray, content: bytes) -> bytes:
     """The state of an instance of a surrogate, which no FMU restores."""
     return _HEAD.pack(_SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
 

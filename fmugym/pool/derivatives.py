@@ -13,8 +13,8 @@ from fmugym.fmi.chain import chained_jacobian
 from fmugym.pool.base import FloatArray
 from fmugym.pool.form import table_of
 from fmugym.pool.spec import PoolSpec
-from fmugym.systems.slots import Layout
 from fmugym.systems.system_description import SystemDescription
+from fmugym.systems.system_layout import SystemLayout
 
 __all__ = ["Variables", "differentiated"]
 
@@ -50,7 +50,7 @@ def differentiated(
     """
     if not isinstance(description, SystemDescription):
         return _of_fmu(0, description, ask, unknowns, knowns)
-    layout = Layout(description, spec.inputs, spec.outputs)
+    layout = SystemLayout(description, spec.inputs, spec.outputs)
 
     def differentiate(part: int, of: Variables, by: Variables) -> FloatArray:
         return np.moveaxis(_of_fmu(part, layout.parts[part].description, ask, of, by), -1, 0)

@@ -1,4 +1,4 @@
-"""Whether the C extension exists, what to install if not, and which of its errors mean what."""
+"""C extension: whether it can be imported, its installation, and its errors."""
 
 from __future__ import annotations
 

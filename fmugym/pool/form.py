@@ -1,4 +1,4 @@
-"""What the C code needs to know before it opens a pool, as bytes.
+"""Forms that open a pool of the C extension, as bytes.
 
 ``NativePool`` hands the bytes to the C extension of this process, and ``ProcessPool`` to those of
 its workers. ``native/form.c`` reads all of them, in the same order.
@@ -31,15 +31,15 @@ from fmugym.pool.spec import (
     ResetMethod,
     is_start_time,
 )
-from fmugym.systems.slots import Layout, PartLayout, array_key
 from fmugym.systems.system_description import PartVariable, SystemDescription
+from fmugym.systems.system_layout import PartLayout, SystemLayout, array_key
 from fmugym.systems.system_plan import Loop
 from fmugym.wine.installation import windows_path, windows_uri
 
 __all__ = [
     "BLANK",
+    "FLOAT64",
     "INTEGER",
-    "NUMBER",
     "START_TIME_TYPE",
     "Files",
     "Writer",
@@ -81,7 +81,7 @@ START_TIME_TYPE: Final = 255
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
-INTEGER, NUMBER = struct.Struct("=q"), struct.Struct("=d")
+INTEGER, FLOAT64 = struct.Struct("=q"), struct.Struct("=d")
 _CLOCK: Final = struct.Struct("=IIdqqdqqq")
 _CLOCKED: Final = struct.Struct("=III")
 _NO_CLOCK: Final = 2**32 - 1
@@ -119,7 +119,7 @@ class Writer:
 
     def numbers(self, *numbers: float) -> Self:
         """Write floating-point numbers."""
-        self._parts += [NUMBER.pack(number) for number in numbers]
+        self._parts += [FLOAT64.pack(number) for number in numbers]
         return self
 
     def optional(self, number: float | None) -> Self:
@@ -395,7 +395,7 @@ def _write_variables(writer: Writer, spec: PoolSpec, version: int) -> None:
 def _write_system(
     writer: Writer, description: SystemDescription, spec: PoolSpec, files: Files
 ) -> None:
-    layout = Layout(description, spec.inputs, spec.outputs)
+    layout = SystemLayout(description, spec.inputs, spec.outputs)
     methods = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     writer.integers(layout.plan.master == "jacobi", len(layout.parts))
     for part, method, resources in zip(layout.parts, methods, files.resources, strict=True):
@@ -439,13 +439,13 @@ def _write_part(
     writer.texts([str(x).encode() for _, x in strings])
 
 
-def _write_routes(writer: Writer, layout: Layout) -> None:
+def _write_routes(writer: Writer, layout: SystemLayout) -> None:
     routes = layout.routes
     writer.array([(route.source, route.target, route.count) for route in routes], np.uint32)
     writer.array([(route.gain, route.offset) for route in routes], np.float64)
 
 
-def _write_arrays(writer: Writer, layout: Layout) -> None:
+def _write_arrays(writer: Writer, layout: SystemLayout) -> None:
     """The arrays that variables of the system are elements of, and their start values."""
     arrays = list(layout.arrays.values())
     starts = (
@@ -458,7 +458,7 @@ def _write_arrays(writer: Writer, layout: Layout) -> None:
     writer.array([number for numbers in starts for number in numbers], np.float64)
 
 
-def _write_ends(writer: Writer, layout: Layout) -> None:
+def _write_ends(writer: Writer, layout: SystemLayout) -> None:
     """Where the ends of each variable begin, and all ends."""
     groups = layout.description.ends
     ends = [end for group in groups for end in group]
@@ -482,7 +482,7 @@ def _write_ends(writer: Writer, layout: Layout) -> None:
     writer.array([(end.gain, end.offset, *end.reading) for end in ends], np.float64)
 
 
-def _type(layout: Layout, end: PartVariable) -> int:
+def _type(layout: SystemLayout, end: PartVariable) -> int:
     """The C type; strings have none, and are never read."""
     if end.variable.kind == "string":
         return 0

@@ -1,4 +1,4 @@
-"""What to do when an FMU gets no licence: wait for one, or raise an error that quotes the FMU."""
+"""Licences of FMUs: wait for one, or raise an error that quotes the FMU."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from fmugym.pool.form import Writer
 
 __all__ = ["Rows", "form_of_play"]
 
-Row = npt.NDArray[Any]
+_Row = npt.NDArray[Any]
 
 
 class Rows:
@@ -26,13 +26,13 @@ class Rows:
         arrays: Those that have a number, in its order.
     """
 
-    def __init__(self, rows: Iterable[Row] = ()) -> None:
-        self.arrays: list[Row] = []
+    def __init__(self, rows: Iterable[_Row] = ()) -> None:
+        self.arrays: list[_Row] = []
         self._numbers: dict[int, int] = {}
         for row in rows:
             self.number(row)
 
-    def number(self, row: Row) -> int:
+    def number(self, row: _Row) -> int:
         """The number of the memory of a row, which gets one if it has none."""
         address = row.__array_interface__["data"][0]
         if address not in self._numbers:
@@ -43,7 +43,7 @@ class Rows:
 
 def form_of_play(
     rows: Rows,
-    programs: Iterable[tuple[bytes, Iterable[Row]]],
+    programs: Iterable[tuple[bytes, Iterable[_Row]]],
     actions: Mapping[str, Any],
     limit: int,
     surroundings: Mapping[str, Any],

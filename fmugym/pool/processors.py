@@ -1,4 +1,4 @@
-"""How many processors and how much memory this process may use, in a container too."""
+"""Processors and memory that this process may use, in a container too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of calls of an FMU that may take minutes."""
+"""Progress messages about calls of an FMU that may take minutes."""
 
 from __future__ import annotations
 

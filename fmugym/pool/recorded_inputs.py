@@ -12,7 +12,8 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import with_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
-from fmugym.pool.bundle import FloatArray, head_of, outputs_of
+from fmugym.pool.base import FloatArray
+from fmugym.pool.bundle import head_of, outputs_of
 from fmugym.pool.form import START_TIME_TYPE, table_of, type_number
 from fmugym.pool.spec import START_TIME, PoolSpec
 

@@ -1,4 +1,4 @@
-"""What the C code reports, in words: failures, refusals to load, and messages of FMUs."""
+"""Reports of the C code in words: failures, refusals to load, and messages of FMUs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.temporary import is_plain
+from fmugym.archive.temporary import is_plain_path
 from fmugym.archive.variable import Variable
 from fmugym.errors import printable
 from fmugym.fmi.status import failed_call
@@ -119,7 +119,7 @@ def loading_failed(fmu: str, error: str, folder: Path, processes: str) -> str:
     and where the FMU gave no reason.
     """
     reason, _, said = error.partition(_SAID)
-    advice = "" if is_plain(folder) else _ADVICE.format(folder)
+    advice = "" if is_plain_path(folder) else _ADVICE.format(folder)
     text = f"{fmu} cannot be loaded: {reason}{quoted(unpacked(said))}{advice}"
     is_full = reason.startswith(_REFUSED) and not (reason == _REFUSED and said)
     return text + processes if is_full and not speaks_of_licence(text) else text

@@ -1,4 +1,4 @@
-"""What the engine is asked for besides steps, in this process or through a worker, and its answers.
+"""Requests to the engine besides steps, in this process or to a worker, and their answers.
 
 Both are forms; see ``fmugym.pool.form``. ``native/requests.c`` is the other end. A worker runs
 foreign code, so its answers may be anything. What does not fit the question is an error, which ends
@@ -20,7 +20,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
-from fmugym.pool.form import BLANK, INTEGER, NUMBER, Writer
+from fmugym.pool.form import BLANK, FLOAT64, INTEGER, Writer
 from fmugym.pool.reports import Failure, describe_failure
 from fmugym.pool.spec import PoolSpec
 
@@ -110,7 +110,7 @@ class Reader:
 
     def number(self) -> float:
         """Read a floating-point number."""
-        return float(NUMBER.unpack(self._take(NUMBER.size))[0])
+        return float(FLOAT64.unpack(self._take(FLOAT64.size))[0])
 
     def block(self) -> bytes:
         """Read bytes with their size."""

@@ -1,4 +1,4 @@
-"""What a caller may wish of a pool."""
+"""Wishes of a caller for a pool: backend, isolation, threads and reset method."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ class Canvas:
 
     @_drawing
     def caption(self, pixel: tuple[int, int], text: str, size: int, color: Color) -> None:
-        """Write one line of text with its upper left corner at a pixel from that of the picture."""
+        """Write a line of text, with its upper left corner at a pixel of the picture."""
         x, y = pixel[0] * _SUPERSAMPLING, pixel[1] * _SUPERSAMPLING
         self._write((x, y), text, size, color, "topleft")
 

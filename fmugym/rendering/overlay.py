@@ -1,4 +1,4 @@
-"""The figures of a step, in a row at the top of a picture."""
+"""Overlay of the figures of a step, in a row at the top of a picture."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -20,7 +20,7 @@ _RENDER_MODES: Final = ("human", "rgb_array")
 
 
 class Scene(Protocol[FrameT_contra]):
-    """The content of a picture: the visible part of the world, and how to draw a frame.
+    """Scene of a picture: the visible part of the world, and a function that draws a frame.
 
     A frame describes one moment. It may be any object; a frozen dataclass works well. Values may
     be NaN or far out of view, because the canvas omits or clips such shapes.

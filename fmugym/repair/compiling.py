@@ -1,4 +1,4 @@
-"""A library for this machine: FMPy's CMake project builds it from the source code in an FMU.
+"""Compiler of an FMU's own source code for this machine, by FMPy's CMake project.
 
 FMI 2.0 lists the source files in the model description, FMI 3.0 in
 ``sources/buildDescription.xml``. FMI 1.0 has no list. FMPy's own call of its project accepts valid
@@ -66,7 +66,7 @@ def compile_fmu(path: Path, output: Path | None = None) -> Path:
 
 
 def _source_files(fmu: FMU, folder: Path) -> Any:
-    """The source files that are compiled together, and how, as FMPy reads them.
+    """Source files that are compiled together, and their options, as FMPy reads them.
 
     Raises:
         FMULoadError: If there are none, or several that are compiled in different ways.
@@ -122,7 +122,7 @@ def _build(fmu: FMU, folder: Path, options: dict[str, str]) -> None:
 
 
 def _cmake(fmu: FMU, folder: Path, arguments: Sequence[str]) -> None:
-    """Call CMake, which comes with FMPy: it is on the path, or where pip puts programs."""
+    """Run CMake, which comes with FMPy: on the path, or among the programs of pip."""
     path = f"{sysconfig.get_path('scripts')}{os.pathsep}{os.environ.get('PATH', '')}"
     try:
         done = subprocess.run(
@@ -145,7 +145,7 @@ def _refusal(fmu: FMU, why: str) -> FMULoadError:
 
 
 def _write(folder: Path, output: Path) -> None:
-    """Pack an FMU. What is there half is removed."""
+    """Pack an FMU; a half-written one is removed."""
     try:
         with output.open("xb") as file:
             create_zip_archive(file, folder)

@@ -33,7 +33,7 @@ class StandIn:
     """A library that was built.
 
     Attributes:
-        path: Where it is.
+        path: Path.
         served: The symbols for which it has a function.
         lacking: The symbols that end the process when they are called.
     """

@@ -1,4 +1,4 @@
-"""Excitation: actions that show what an FMU does."""
+"""Excitation of an FMU: disturbed actions for the identification of a surrogate."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Any, Final, Self
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.parsing import has_range, search_of
+from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.search.flattening import choices_of
-from fmugym.search.policy import Agent, Policy
+from fmugym.search.policy import ResidualAgent, ResidualPolicy
 from fmugym.search.probe import Probe
 from fmugym.surrogate.courses import Course, Courses
 from fmugym.surrogate.surrogate import Surrogate
@@ -24,47 +25,47 @@ from fmugym.surrogate.surrogate_fit import fit
 __all__ = ["Excitation", "excite", "fitted_surrogate"]
 
 _RANDOM: Final = 0.4
-"""The part of segments with an action at random,"""
+"""Share of segments with a random action."""
 
 _SHIFTED: Final = 0.3
-"""of those that shift the action of the controller,"""
+"""Share of segments in which the action of the controller is shifted."""
 
 _AT_AN_END: Final = 0.3
-"""and of random actions that are an end of their range."""
+"""Share of random actions that are an end of their range."""
 
 _SHIFT: Final = 0.3
-"""The largest shift, as a part of the range."""
+"""Largest shift, as a part of the range."""
 
 _SEEDS: Final = 500_000
-"""Seeds are smaller than those of validations."""
+"""Upper bound of the seeds; seeds of validations are larger."""
 
 _LONGEST: Final = 16
-"""The steps of a segment are between 1 and so many, short ones as often as long ones."""
+"""Longest segment, in steps; short segments are as frequent as long ones."""
 
 
 _STARTS: Final = 32
-"""Starts of episodes without a step, which tell how episodes begin."""
+"""Number of starts without a step, which show the outputs at the beginning of episodes."""
 
 _GROUP: Final = 8
 _OF_PROBE: Final = 20
-"""The look at a task takes one step of so many."""
+"""One step of so many is for the probe of a task."""
 
 _OF_TEST: Final = 4
-"""The test by which controllers are guessed takes one step of so many, at most."""
+"""One step of so many, at most, is for the step test that suggests controllers."""
 
 _EPISODES: Final = 8
-"""Steps are divided among so many episodes, or more if these are shorter."""
+"""Number of episodes among which steps are divided; more if these are shorter."""
 
 
 def fitted_surrogate(
     make_env: Callable[[], Any], steps: int, seed: int = 0, unseen: int = 0
 ) -> tuple[Surrogate, list[Course]]:
-    """Excite an FMU, and fit a surrogate to what it does.
+    """Excite an FMU, and fit a surrogate to the trajectories.
 
     Args:
         make_env: Makes the environment, in the physical form of its task.
         steps: The steps of the FMU, at most.
-        seed: Of episodes and actions.
+        seed: Seed of episodes and actions.
         unseen: How many more episodes are played afterwards, for a test. Their steps do not count.
 
     Returns:
@@ -84,24 +85,28 @@ def fitted_surrogate(
         backend=courses,
     )
     length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
-    with closing(Arena(make_env, _GROUP, length, backend=courses)) as arena:
-        excite(arena, courses, probe, (steps - courses.steps) // length, rng)
+    with closing(CandidateEvaluator(make_env, _GROUP, length, backend=courses)) as evaluator:
+        excite(evaluator, courses, probe, (steps - courses.steps) // length, rng)
         found, known = fit(courses), len(courses.all())
         if unseen:
-            arena.most_steps = probe.most_steps
-            excite(arena, courses, probe, unseen, rng)
+            evaluator.most_steps = probe.most_steps
+            excite(evaluator, courses, probe, unseen, rng)
     return found, [one for one in courses.all()[known:] if one.steps]
 
 
 def excite(
-    arena: Arena, courses: Courses, probe: Probe, count: int, rng: np.random.Generator
+    evaluator: CandidateEvaluator,
+    courses: Courses,
+    probe: Probe,
+    count: int,
+    rng: np.random.Generator,
 ) -> None:
     """Play episodes with the untuned controllers of a task, whose actions are disturbed.
 
     Args:
-        arena: Its episodes are no longer than they shall be; its backend are the courses.
+        evaluator: Its episodes are no longer than they shall be; its backend are the courses.
         courses: Keep what the FMU does.
-        probe: What is known of the task.
+        probe: Probe of the task.
         count: How many episodes there are.
         rng: Draws episodes and actions.
     """
@@ -110,9 +115,9 @@ def excite(
         own = seeds[place :: len(probe.agents)]
         if own:
             seed = int(rng.integers(_SEEDS))
-            made = partial(_excitation, arena, agent, seed)
-            arena.play(made, np.zeros((1, 1)), own)
-    envs = arena.open(1)
+            made = partial(_excitation, evaluator, agent, seed)
+            evaluator.play(made, np.zeros((1, 1)), own)
+    envs = evaluator.open(1)
     starts = rng.integers(_SEEDS, size=_STARTS)
     for begin in range(0, _STARTS, envs.num_envs):
         before = courses.steps
@@ -121,12 +126,14 @@ def excite(
             return
 
 
-def _excitation(arena: Arena, agent: Agent, seed: int, rows: FloatArray) -> Any:
-    """The excitation of the episodes that an arena plays next."""
-    return Excitation(_untuned(agent), seed, arena.jobs)
+def _excitation(
+    evaluator: CandidateEvaluator, agent: ResidualAgent, seed: int, rows: FloatArray
+) -> Any:
+    """The excitation of the episodes that an evaluator plays next."""
+    return Excitation(_untuned(agent), seed, evaluator.jobs)
 
 
-def _untuned(agent: Agent) -> Policy:
+def _untuned(agent: ResidualAgent) -> ResidualPolicy:
     """An agent whose numbers are in the middle of their ranges, and whose weights are 0."""
     if has_range(agent.text):
         middle = np.full(len(search_of(agent.text).ranges), 0.5)
@@ -139,7 +146,7 @@ class Excitation:
 
     Args:
         controller: The controller.
-        seed: Of the segments.
+        seed: Seed of the segments.
         episodes: The number of each environment's episode among those with this seed, shape (N,),
             so that episodes do not depend on how many environments step together.
     """

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.controller import FloatArray
 from fmugym.errors import ConfigError
+from fmugym.pool.base import FloatArray
 
-__all__ = ["choices_of", "require_numbers", "rows_of"]
+__all__ = ["choices_of", "flattened_observations", "require_numbers"]
 
 
-def rows_of(space: spaces.Space[Any], observations: Any, count: int) -> FloatArray:
+def flattened_observations(space: spaces.Space[Any], observations: Any, count: int) -> FloatArray:
     """Flatten N observations as ``gymnasium.spaces.flatten`` does each: shape (N, k).
 
     Args:

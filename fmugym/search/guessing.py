@@ -1,4 +1,4 @@
-"""Controllers that a task suggests without declaring them."""
+"""Controllers that step tests of a task suggest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena, most_steps_of
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, most_steps_of
 from fmugym.baselines.table_texts import text_of
 from fmugym.errors import ConfigError
 from fmugym.search.pairing import MOST_PAIRED, best_pairing
@@ -33,37 +33,37 @@ MOST_TESTED: Final = 2000
 """Steps of a test, at most, unless somebody says another number."""
 
 _GAINS: Final = 0.3, 30.0
-"""Gains are tried between these multiples of the inverse of what the plant has."""
+"""Range of tried gains, as multiples of the inverse of the plant's gain."""
 
 _BANDS: Final = 0.01, 0.5
-"""Bands of thermostats are tried between these parts of what the action changes."""
+"""Range of tried bands of thermostats, as parts of the change that the action causes."""
 
 _TRIED: Final = 2
-"""Steps that tell how long a test takes."""
+"""Steps that measure the time of a test."""
 
 _USUAL_STEPS: Final = 100
-"""Those of an episode without an end."""
+"""Assumed length of an episode without an end, in steps."""
 
 _KINDS: Final = "PI", "P"
 _MOST_PAIRINGS: Final = 2
 _MOST_FREE: Final = 10
-"""So many values without a set point may have one that is tuned: those that actions move most,
-beside their limits."""
+"""Most values without a set point for which one is tuned: the values that actions move most,
+relative to their limits."""
 
 
 @dataclass(frozen=True)
 class Loops:
-    """What a task tells of control loops, in which each action controls a measured value.
+    """Control loops of a task, in which each action controls a measured value.
 
     Attributes:
         actions: Their names.
-        limits: Those of each action.
+        limits: Limits of each action.
         switches: The actions that are on or off.
         measured: The names of what is observed and measured.
-        setpoints: What a measured value may have to be, names or numbers, by its name.
+        setpoints: Possible set points, names or numbers, by measured value.
         widths: The ranges of what is observed, by name; infinite without limits.
-        time_step: That of the task in s.
-        most_steps: Those of an episode.
+        time_step: Time step of the task in s.
+        most_steps: Most steps of an episode.
     """
 
     actions: Sequence[str]
@@ -77,10 +77,10 @@ class Loops:
 
     @classmethod
     def of(cls, document: Mapping[str, Any], env: Any) -> Self | None:
-        """Those of a task.
+        """Find the control loops of a task.
 
         Args:
-            document: What it declares.
+            document: Declarations.
             env: Its environment in the physical form.
 
         Returns:
@@ -111,7 +111,7 @@ class Loops:
 
 
 def _measured(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """What is observed and measured: no set points, data and memory, no forecasts and histories."""
+    """Measured values of the observation: no set points, data, memory, forecasts or histories."""
     given = {
         one for section in ("setpoints", "data", "memory") for one in document.get(section, ())
     }
@@ -121,7 +121,7 @@ def _measured(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:
 
 
 def _setpoints(document: Mapping[str, Any], env: Any) -> dict[str, list[str | float]]:
-    """What measured values may have to be: the other sides of a minus in an expression.
+    """Possible set points of measured values: the other sides of differences in expressions.
 
     Set points come before what is measured itself, and names before numbers.
     """
@@ -146,12 +146,14 @@ def _steps_of_episode(loops: Loops, most: int) -> int:
     return min(most // episodes_of(len(loops.actions)), loops.most_steps)
 
 
-def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -> dict[str, str]:
-    """Test the plant of an arena by steps, and guess controllers; see ``guessed_controllers``.
+def suggested_controllers(
+    evaluator: CandidateEvaluator, loops: Loops, most: int = MOST_TESTED
+) -> dict[str, str]:
+    """Test the plant of an evaluator by steps, and guess controllers; see ``guessed_controllers``.
 
     Args:
-        arena: Of a task.
-        loops: What the task tells.
+        evaluator: Evaluator of a task.
+        loops: Control loops of the task.
         most: The largest number of steps.
 
     Raises:
@@ -159,10 +161,10 @@ def suggested_controllers(arena: Arena, loops: Loops, most: int = MOST_TESTED) -
     """
     if len(loops.actions) > MOST_PAIRED:
         raise ConfigError(f"there are more than {MOST_PAIRED} actions")
-    arena.most_steps = _steps_of_episode(loops, most)
-    if arena.most_steps <= FEWEST:
+    evaluator.most_steps = _steps_of_episode(loops, most)
+    if evaluator.most_steps <= FEWEST:
         raise ConfigError(f"{most} steps are too few for a test of the actions")
-    return guessed_controllers(loops, step_test(arena, loops.limits))
+    return guessed_controllers(loops, step_test(evaluator, loops.limits))
 
 
 def controllers_for(make_env: Callable[[], Any], seconds: float) -> dict[str, str]:
@@ -176,18 +178,18 @@ def controllers_for(make_env: Callable[[], Any], seconds: float) -> dict[str, st
         loops = Loops.of(env.task.document, env)
     if loops is None:
         raise ConfigError("no expression of the task has the difference to a set point")
-    with closing(Arena(make_env, most_steps=_TRIED)) as arena:
-        step_test(arena, loops.limits)
-        most = seconds * arena.steps / max(arena.seconds, 1e-9)
-        return suggested_controllers(arena, loops, int(min(MOST_TESTED, most)))
+    with closing(CandidateEvaluator(make_env, most_steps=_TRIED)) as evaluator:
+        step_test(evaluator, loops.limits)
+        most = seconds * evaluator.steps / max(evaluator.seconds, 1e-9)
+        return suggested_controllers(evaluator, loops, int(min(MOST_TESTED, most)))
 
 
 def guessed_controllers(loops: Loops, responses: StepResponses) -> dict[str, str]:
     """The controllers that step responses suggest: one for each action, paired by its gains.
 
     Args:
-        loops: What the task tells.
-        responses: What a test tells.
+        loops: Control loops of the task.
+        responses: Results of a step test.
 
     Returns:
         Texts for ``search_of`` by name, the least coupled pairing first. If there are several
@@ -277,13 +279,13 @@ class _Guess:
         return wanted
 
     def _free(self) -> list[int]:
-        """The rows whose set point is to be found; not those that only tell what an action is."""
+        """Rows whose set point is to be found, without rows that only tell what an action is."""
         rows = self._moving(has_setpoint=False)
         slow = [row for row in rows if not self.responses.is_instant[row]]
         return sorted(slow or rows, key=self._movement, reverse=True)[:_MOST_FREE]
 
     def _movement(self, row: int) -> float:
-        """How far actions move something, beside its limits."""
+        """Range over which actions move each value, relative to its limits."""
         width = self.loops.widths[self.responses.names[row]]
         largest = float(np.abs(self.responses.ends[:, row]).max())
         moved = float(np.abs(self.responses.gains[row]).max())

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.baselines.controller import FloatArray
+from fmugym.pool.base import FloatArray
 
 __all__ = ["MOST_PAIRED", "best_pairing", "niederlinski_index", "relative_gains"]
 
@@ -23,7 +23,7 @@ def relative_gains(gains: FloatArray) -> FloatArray:
     """The relative gain array of Bristol (1966): each gain, beside that with all others controlled.
 
     Args:
-        gains: Of each measured value by each action, shape (n, n).
+        gains: Gains of each measured value by each action, shape (n, n).
     """
     relative: FloatArray = gains * np.linalg.pinv(gains).T
     return relative

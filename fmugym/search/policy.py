@@ -1,4 +1,4 @@
-"""Agents that a search finds, and how they decide: controllers that a network corrects."""
+"""Policies that a search finds: controllers, corrected by a network."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.arena import Arena, Outcome
-from fmugym.baselines.controller import Controller, FloatArray, attribute_of, either, limited
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, CandidateScores
+from fmugym.baselines.controller import Controller, attribute_of, either, limited
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.baselines.tuning import numbers_at
 from fmugym.checks import (
@@ -28,14 +28,15 @@ from fmugym.checks import (
     check_text,
     require_regular,
 )
-from fmugym.errors import ConfigError, reading, shown
+from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.expressions.value import Value
 from fmugym.files import write_whole
-from fmugym.search.flattening import choices_of, rows_of
+from fmugym.pool.base import FloatArray
+from fmugym.search.flattening import choices_of, flattened_observations
 
-__all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
+__all__ = ["LIMIT", "POLICY_FILE", "ResidualAgent", "ResidualPolicy", "require_task", "scale_of"]
 
-AGENT: Final = "policy.json"
+POLICY_FILE: Final = "policy.json"
 """The file of an agent in its folder."""
 
 LIMIT: Final = 5.0
@@ -47,16 +48,15 @@ _FADE: Final = 0.05
 _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
 
-Memory = tuple[FloatArray, ...]
-"""What a policy keeps from one step to the next: the last observation, its leaky integral, and the
-last action."""
+PolicyState = tuple[FloatArray, ...]
+"""Memory of a policy: the last observation, its leaky integral, and the last action."""
 
 
 def scale_of(moments: FloatArray) -> FloatArray:
-    """What features are like.
+    """Mean and scale of features.
 
     Args:
-        moments: The sums of what ``Policy.moments`` gives in each step.
+        moments: The sums of what ``ResidualPolicy.moments`` gives in each step.
 
     Returns:
         The mean of each feature, and its standard deviation, shape (2, f); constant ones are not
@@ -107,17 +107,17 @@ _CHECKS: Final[dict[str, Callable[[str, Any], Any]]] = {
     "names": _names,
     "actions": check_text,
 }
-"""What the file of an agent has, and what may be there."""
+"""Checks of the entries in the file of an agent."""
 
 
 @dataclass(frozen=True)
-class Agent:
+class ResidualAgent:
     """A controller, and a network that corrects it.
 
     Until they are found, the text has ranges in the places of numbers, or the weights are missing.
 
     Attributes:
-        name: What it is called.
+        name: Name of the agent.
         text: The controller, as ``controller_of`` or ``search_of`` reads it; None for the middle of
             the range.
         observed: The number of observations that the network sees; 0 for one that gives constants.
@@ -125,9 +125,9 @@ class Agent:
         hidden: The width of its hidden layer, which ends in a tanh; 0 for none.
         history: Whether it also sees the last change of each observation, its leaky integral, and
             the last action.
-        weights: Those of the network, shape (n,), or (N, n) with those of each environment.
+        weights: Weights of the network, shape (n,), or (N, n) with those of each environment.
         scale: Mean and divisor of each feature, shape (2, f).
-        names: What it observes; empty if that is not known yet.
+        names: Names of its observations; empty if that is not known yet.
         actions: The action space, in words.
     """
 
@@ -142,35 +142,37 @@ class Agent:
     names: Sequence[str] = ()
     actions: str = ""
 
-    def __call__(self, rows: FloatArray) -> Policy:
-        """The policy with what was missing, shape (n,) or (N, n), to be bound to N environments.
+    def __call__(self, rows: FloatArray) -> ResidualPolicy:
+        """The policy with the found numbers, shape (n,) or (N, n), for N environments.
 
         Binding it raises ``ConfigError`` if the agent is for another task.
         """
         if has_range(self.text):
             tunable = search_of(self.text)
-            return Policy(tunable.make(**numbers_at(tunable.ranges, rows)))
+            return ResidualPolicy(tunable.make(**numbers_at(tunable.ranges, rows)))
         baseline = None if self.text is None else controller_of(self.text)
-        return Policy(baseline, replace(self, weights=rows))
+        return ResidualPolicy(baseline, replace(self, weights=rows))
 
-    def with_numbers(self, found: FloatArray) -> Agent:
-        """The agent with what was missing, shape (n,)."""
+    def with_numbers(self, found: FloatArray) -> ResidualAgent:
+        """The agent with the found numbers, shape (n,)."""
         if has_range(self.text):
             tunable = search_of(self.text)
-            return Agent(f"tuned {self.name}", tunable.text(numbers_at(tunable.ranges, found)))
+            return ResidualAgent(
+                f"tuned {self.name}", tunable.text(numbers_at(tunable.ranges, found))
+            )
         return replace(self, weights=found)
 
-    def policy(self) -> Policy:
+    def policy(self) -> ResidualPolicy:
         """The controller, to be bound to an environment, as by a call."""
         return self(self.weights)
 
-    def play(self, arena: Arena, seeds: Sequence[int]) -> Outcome:
+    def play(self, evaluator: CandidateEvaluator, seeds: Sequence[int]) -> CandidateScores:
         """Let the agent play alone."""
-        return arena.play(self, np.atleast_2d(self.weights), seeds)
+        return evaluator.play(self, np.atleast_2d(self.weights), seeds)
 
     def save(self, folder: Path) -> None:
         """Write the agent to a folder; a file that is there is replaced."""
-        write_whole(folder / AGENT, self.content())
+        write_whole(folder / POLICY_FILE, self.content())
 
     def content(self) -> bytes:
         """The content of its file."""
@@ -185,10 +187,10 @@ class Agent:
         """
         failure = f"the agent in {shown(str(folder))} cannot be read"
         try:
-            with reading(failure):
-                require_regular(folder / AGENT)
-                text = (folder / AGENT).read_text(encoding="utf-8")
-                return cls._checked(check_mapping(AGENT, json.loads(text)))
+            with reading_file(failure):
+                require_regular(folder / POLICY_FILE)
+                text = (folder / POLICY_FILE).read_text(encoding="utf-8")
+                return cls._checked(check_mapping(POLICY_FILE, json.loads(text)))
         except ConfigError as error:
             raise ConfigError(f"{failure}: {str(error).removeprefix(f'{failure}: ')}") from error
 
@@ -215,7 +217,7 @@ class Agent:
 
     @property
     def features(self) -> int:
-        """How many numbers the network sees."""
+        """Number of inputs of the network."""
         return 3 * self.observed + self.acting if self.history else self.observed
 
     @property
@@ -230,7 +232,7 @@ class Agent:
         return sum(before * after for before, after in self.shapes)
 
     def extended(self, weights: FloatArray) -> FloatArray:
-        """The weights that decide as those of N linear policies that see the first features only.
+        """Weights of the same decisions as N linear policies of the first features.
 
         This one is linear, too.
 
@@ -264,10 +266,10 @@ def _faded(now: Any, last: Any, leaky: Any) -> Any:
     return either(last != last, now, leaky + _FADE * (now - leaky))
 
 
-_NO_NETWORK: Final = Agent("")
+_NO_NETWORK: Final = ResidualAgent("")
 
 
-class Policy(Controller):
+class ResidualPolicy(Controller):
     """A controller whose action a network corrects.
 
     Of a ``Box`` the action is that of the controller, and half of the range times what the network
@@ -282,7 +284,7 @@ class Policy(Controller):
 
     masks: Callable[[], Any] | None
 
-    def __init__(self, baseline: Controller | None, agent: Agent = _NO_NETWORK) -> None:
+    def __init__(self, baseline: Controller | None, agent: ResidualAgent = _NO_NETWORK) -> None:
         self.baseline, self.agent = baseline, agent
 
     def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
@@ -302,7 +304,7 @@ class Policy(Controller):
         return names or tuple(map(str, range(spaces.flatdim(self._seen))))
 
     def _rows(self, observation: Any) -> FloatArray:
-        return rows_of(self._seen, observation, self.count)
+        return flattened_observations(self._seen, observation, self.count)
 
     def _prepare(self) -> None:
         space: Any = self.space
@@ -319,7 +321,7 @@ class Policy(Controller):
         self._memory = self.starts
 
     def _require_size(self) -> None:
-        """Refuse a network that does not fit the task, as that of a damaged file."""
+        """Refuse a network that does not fit the task, such as one of a damaged file."""
         agent, seen = self.agent, len(self.names)
         fits = agent.observed == seen if agent.history else agent.observed <= seen
         if not fits or agent.acting != self.acting:
@@ -341,7 +343,7 @@ class Policy(Controller):
         return np.stack(self._step(rows, base), axis=-1)
 
     def _step(self, observed: FloatArray, base: FloatArray) -> list[Any]:
-        """The elements of the action; what ``corrected`` says in formulas."""
+        """Compute the action, as the formulas of ``corrected`` do, and update the memory."""
         if not self.agent.acting:
             return [*base]
         features = observed[:, : self.agent.observed]
@@ -367,8 +369,8 @@ class Policy(Controller):
         return np.repeat(np.array(middle)[:, None], self.count, axis=1)
 
     @property
-    def starts(self) -> Memory:
-        """What the network sees of the past, at the beginning of an episode."""
+    def starts(self) -> PolicyState:
+        """Memory of the network at the beginning of an episode."""
         if not self.agent.history:
             return ()
         width = len(self.names)
@@ -381,12 +383,12 @@ class Policy(Controller):
         base: Sequence[Value],
         network: Callable[[Sequence[Value]], Sequence[Value]],
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
-        """The formulas of what the network makes of the controller's decision.
+        """Formulas of the corrected action and of the new memory.
 
         Args:
             observation: Its elements.
-            memory: What the network sees of the past, in the order of ``starts``.
-            base: What the controller has decided, the m elements of the action.
+            memory: Past values that the network sees, in the order of ``starts``.
+            base: Decision of the controller, the m elements of the action.
             network: Gives the m corrections, or the chosen elements, for some features.
 
         Returns:
@@ -403,14 +405,14 @@ class Policy(Controller):
         return action, (observation, leaky, self._told(action))
 
     def added(self, changes: Sequence[Any]) -> list[Any] | None:
-        """What the network adds to the action and the controller takes notice of.
+        """Correction of the action, of which the controller takes notice.
 
         A controller that a search corrects takes no notice: None.
         """
         return None
 
     def _with_changes(self, base: Sequence[Any], changes: Sequence[Any]) -> list[Any]:
-        """The elements of the action, of what the controller and the network say."""
+        """Elements of the action, from the controller and the network."""
         if self.choices:
             return list(changes)
         return [
@@ -453,12 +455,12 @@ class Policy(Controller):
 def require_task(
     agent: str, own: tuple[Sequence[str], str], here: tuple[Sequence[str], str]
 ) -> None:
-    """Refuse another task than that of an agent.
+    """Refuse a task other than the agent's.
 
     Args:
-        agent: What to call it.
+        agent: Name of the agent in messages.
         own: The names of what it observes, and what its actions are.
-        here: Those of the task.
+        here: Observations and actions of the task.
 
     Raises:
         ConfigError: With what differs.

@@ -1,4 +1,4 @@
-"""What a search has to know of a task before it begins."""
+"""Probe of a task before a search: its length, speed, observations and first controllers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena, most_steps_of
+from fmugym.baselines.candidate_evaluation import MOST_STEPS, CandidateEvaluator, most_steps_of
 from fmugym.baselines.parsing import plans_ahead, simple_controllers
 from fmugym.baselines.table_texts import acting_text, named_controllers, parts_of
 from fmugym.declared.likely_units import require_units
@@ -17,9 +17,9 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import require_numbers
 from fmugym.search.guessing import MOST_TESTED, Loops, steps_of_test, suggested_controllers
-from fmugym.search.policy import Agent, Policy
+from fmugym.search.policy import ResidualAgent, ResidualPolicy
 
-__all__ = ["FEW", "MOST_PROBED", "Probe", "task_of"]
+__all__ = ["FEW", "MOST_PROBED", "Probe", "agent_task"]
 
 FEW: Final = 8
 """The candidates of a round for a controller, which has few numbers."""
@@ -31,14 +31,14 @@ _STEPS: Final = 100
 
 _QUICK: Final = 2e-3
 _TRIED: Final = 2
-"""Steps that tell how long all others would take."""
+"""Steps that measure the time of a step."""
 
 _TIMED: Final = 25
 """If a step takes less than this in seconds, as many candidates as in a round tell its time by so
 many steps: the overhead of a call is for all of them."""
 
 MOST_PROBED: Final = _EPISODES * (_ACTIONS * (_TRIED + _STEPS) + FEW * _TIMED)
-"""The steps of a probe, at most. As many count, since how many there are depends on the time."""
+"""Most steps of a probe. All of them count, since the number that is played depends on the time."""
 
 
 _TEST_BY_LOOK: Final = 5
@@ -47,14 +47,14 @@ _TEST_BY_LOOK: Final = 5
 
 @dataclass(frozen=True)
 class Probe:
-    """What is known of a task.
+    """Facts about a task that a search needs.
 
     Attributes:
-        task: See ``task_of``.
+        task: See ``agent_task``.
         linear: The linear policy without a controller, whose weights are missing.
         agents: Controllers that the task declares and that do not plan ahead. Without any, those
             that suggest themselves, or else a constant action.
-        limits: What each cost may add up to in an episode.
+        limits: Limits of the costs of an episode.
         most_steps: The steps after which an episode is stopped.
         is_same: Whether all episodes are the same.
         seconds: Real time of a step of one environment among many.
@@ -63,8 +63,8 @@ class Probe:
     """
 
     task: Mapping[str, Any]
-    linear: Agent
-    agents: Sequence[Agent]
+    linear: ResidualAgent
+    agents: Sequence[ResidualAgent]
     limits: Mapping[str, float]
     most_steps: int
     is_same: bool
@@ -99,37 +99,46 @@ class Probe:
         """
         with closing(make_env()) as env:
             require_numbers(env.observation_space, env.action_space)
-            policy, task = Policy(None).bind(env), task_of(env)
+            policy, task = ResidualPolicy(None).bind(env), agent_task(env)
             require_units(env)
             agents = list(_declared(task, env, tell))
             loops = None if agents else Loops.of(task, env)
             length = most_steps_of(env)
             limits = dict(getattr(env, "cost_limits", {}))
-        linear = Agent("linear", None, len(policy.names), policy.acting)
-        constant = Agent("constant action", acting=policy.acting)
+        linear = ResidualAgent("linear", None, len(policy.names), policy.acting)
+        constant = ResidualAgent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
         steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
-        with closing(Arena(make_env, envs, _TRIED, backend=backend)) as arena:
+        with closing(CandidateEvaluator(make_env, envs, _TRIED, backend=backend)) as evaluator:
             seeds = range(_EPISODES)
             if seconds < np.inf:
-                arena.play(linear, rows[:_ACTIONS], seeds)
-                needed = most * arena.seconds / arena.steps
+                evaluator.play(linear, rows[:_ACTIONS], seeds)
+                needed = most * evaluator.seconds / evaluator.steps
                 steps = steps if needed <= seconds else max(_TRIED, int(steps * seconds / needed))
-            arena.most_steps, arena.seconds, arena.steps, arena.longest = steps, 0.0, 0, 0
-            outcome = arena.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
-            if arena.steps == outcome.costs[..., -1].sum():
+            evaluator.most_steps, evaluator.seconds, evaluator.steps, evaluator.longest = (
+                steps,
+                0.0,
+                0,
+                0,
+            )
+            outcome = evaluator.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
+            if evaluator.steps == outcome.costs[..., -1].sum():
                 raise ConfigError(
-                    f"the first step fails, whatever the action: {arena.infos['fault'][0]}; "
+                    f"the first step fails, whatever the action: {evaluator.infos['fault'][0]}; "
                     "'fmugym validate' tells more"
                 )
-            if most == MOST_PROBED and steps == _STEPS and arena.seconds < _QUICK * arena.steps:
-                arena.most_steps, arena.seconds, arena.steps = _TIMED, 0.0, 0
-                arena.play(linear, rows, seeds)
-            pace, longest = arena.seconds / arena.steps, arena.longest
+            if (
+                most == MOST_PROBED
+                and steps == _STEPS
+                and evaluator.seconds < _QUICK * evaluator.steps
+            ):
+                evaluator.most_steps, evaluator.seconds, evaluator.steps = _TIMED, 0.0, 0
+                evaluator.play(linear, rows, seeds)
+            pace, longest = evaluator.seconds / evaluator.steps, evaluator.longest
             if seconds < np.inf:
                 most_tested = int(min(most_tested, _TEST_BY_LOOK * seconds / max(pace, 1e-9)))
-            agents = agents or list(_guessed(arena, loops, tell, most_tested))
+            agents = agents or list(_guessed(evaluator, loops, tell, most_tested))
         seen = np.dstack([outcome.returns, outcome.moments])
         if np.ptp(outcome.returns) == 0:
             tell(
@@ -152,17 +161,19 @@ class Probe:
         )
 
     def round_time(self, episodes: int) -> float:
-        """About how many seconds a round of a controller takes, until episodes become longer."""
+        """Estimated seconds of a round of a controller, until episodes become longer."""
         return self.seconds * self.usual_steps * FEW * episodes
 
 
-def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) -> Iterator[Agent]:
+def _declared(
+    task: Mapping[str, Any], env: Any, tell: Callable[[str], None]
+) -> Iterator[ResidualAgent]:
     """The controllers that a task declares, that do not plan ahead and that fit its actions."""
     given = task.get("controllers", {})
     for name, one in named_controllers(given).items():
         if plans_ahead(one):
             continue
-        agent = Agent(name, acting_text(one))
+        agent = ResidualAgent(name, acting_text(one))
         try:
             (controller,) = simple_controllers({name: agent.text})
             controller.bind(env)
@@ -174,21 +185,24 @@ def _declared(task: Mapping[str, Any], env: Any, tell: Callable[[str], None]) ->
 
 
 def _guessed(
-    arena: Arena, loops: Loops | None, tell: Callable[[str], None], most_tested: int
-) -> Iterator[Agent]:
+    evaluator: CandidateEvaluator,
+    loops: Loops | None,
+    tell: Callable[[str], None],
+    most_tested: int,
+) -> Iterator[ResidualAgent]:
     """Controllers that a step test suggests for some loops."""
     if loops is None:
         return
     try:
-        guesses = suggested_controllers(arena, loops, most_tested)
+        guesses = suggested_controllers(evaluator, loops, most_tested)
     except ConfigError as error:
         tell(f"no controller is guessed: {error}")
     else:
-        yield from (Agent(name, text) for name, text in guesses.items())
+        yield from (ResidualAgent(name, text) for name, text in guesses.items())
 
 
-def task_of(env: Any) -> dict[str, Any]:
-    """What agents are for: the observations, the action space, and what a task file declares."""
-    policy = Policy(None).bind(env)
+def agent_task(env: Any) -> dict[str, Any]:
+    """Identity of an agent's task: observations, action space, and the declarations of its file."""
+    policy = ResidualPolicy(None).bind(env)
     declared = env.task.document if hasattr(env, "task") else {}
     return {"observations": policy.names, "actions": str(policy.space), **declared}

@@ -1,4 +1,4 @@
-"""Residual policies: controllers to whose actions a network of another library adds."""
+"""Residual policies: controllers, to whose actions a network of another library adds."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.controller import Controller, FloatArray, limited
+from fmugym.baselines.controller import Controller, limited
 from fmugym.errors import ConfigError
 from fmugym.expressions.value import Value
-from fmugym.search.policy import Agent, Memory, Policy
+from fmugym.pool.base import FloatArray
+from fmugym.search.policy import PolicyState, ResidualAgent, ResidualPolicy
 
 __all__ = ["Residual"]
 
 _SINGLE: Final = np.dtype(np.float32)
 
 
-class Residual(Policy):
+class Residual(ResidualPolicy):
     """A controller to whose action a model of Stable-Baselines3 adds.
 
     The model sees the observation and the controller's action, which goes from -1 to 1. It adds a
@@ -32,8 +33,8 @@ class Residual(Policy):
         scale: The part of the range.
         model: The model; None for one that is trained now.
         normalization: Its ``VecNormalize``, or None.
-        task: The names of what it observes and the action space in words, see ``Agent``; it is for
-            this task only. None for any.
+        task: The names of what it observes and the action space in words, see ``ResidualAgent``;
+            it is for this task only. None for any.
     """
 
     baseline: Controller
@@ -47,7 +48,7 @@ class Residual(Policy):
         task: tuple[Sequence[str], str] | None = None,
     ) -> None:
         names, actions = task or ((), "")
-        super().__init__(controller, Agent("residual", names=names, actions=actions))
+        super().__init__(controller, ResidualAgent("residual", names=names, actions=actions))
         self.scale, self.model, self.normalization = scale, model, normalization
 
     def _prepare(self) -> None:
@@ -59,7 +60,7 @@ class Residual(Policy):
     # Of arrays.
 
     def seen(self, observation: Any) -> npt.NDArray[np.float32]:
-        """What the model sees, shape (N, k + m); the controller decides."""
+        """Observation of the model, shape (N, k + m); the controller decides first."""
         return self._features(self._rows(observation))
 
     def _features(self, rows: FloatArray) -> npt.NDArray[np.float32]:
@@ -69,7 +70,7 @@ class Residual(Policy):
         return np.concatenate([rows, told], axis=1).astype(_SINGLE)
 
     def actions(self, changes: Any) -> Any:
-        """The actions of what the model gives, shape (N, ...), from -1 to 1."""
+        """Actions from the outputs of the model, shape (N, ...), from -1 to 1."""
         return self._as_actions(self._summed(np.asarray(changes, np.float64)))
 
     def _summed(self, changes: FloatArray) -> FloatArray:
@@ -102,7 +103,7 @@ class Residual(Policy):
         return self._told([limited(one, low, high) for one, (low, high) in limits])
 
     def added(self, changes: Sequence[Any]) -> list[Any]:
-        """See ``Policy.added``."""
+        """See ``ResidualPolicy.added``."""
         limits = zip(changes, self.limits, strict=True)
         return [self.scale * (high - low) * one for one, (low, high) in limits]
 
@@ -117,12 +118,12 @@ class Residual(Policy):
         base: Sequence[Value],
         network: Callable[[Sequence[Value]], Sequence[Value]],
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
-        """See ``Policy.corrected``."""
+        """See ``ResidualPolicy.corrected``."""
         features = [*observation, *self._controlled(base)]
         changes = network([one.cast(_SINGLE).number for one in features])
         return self._with_changes(base, changes), ()
 
     @property
-    def starts(self) -> Memory:
-        """See ``Policy.starts``; the model remembers nothing."""
+    def starts(self) -> PolicyState:
+        """See ``ResidualPolicy.starts``; the model remembers nothing."""
         return ()

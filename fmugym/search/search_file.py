@@ -1,4 +1,4 @@
-"""The file of a search: its numbers and texts, from which it goes on as if nothing had happened.
+"""File of a search, from which the search continues exactly.
 
 The file is an ``.npz`` archive of NumPy: arrays of numbers, and a text of JSON with all else, in
 which the names of arrays stand for them. It holds nothing that could run.
@@ -15,11 +15,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym.baselines.candidate_search import CandidateSearch
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import controller_of, has_range, search_of
 from fmugym.errors import ConfigError
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.search.probe import Probe
 from fmugym.search.search import Search
 
@@ -30,14 +30,14 @@ _TEXT: Final = "text"
 """The name of the array of bytes that is the text."""
 
 _COUNTS: Final = ("episodes", "rounds", "gained", "starts", "last_round")
-"""Those of an ``Entrant``."""
+"""Counts of a ``CandidateSearch``."""
 
 _MOST: Final = 1_000_000
 """No count of numbers is larger; a damaged file could ask for any memory."""
 
 
 def plain_of(value: Any) -> Any:
-    """What JSON keeps of a value: of a task, what tells it from others."""
+    """Convert a value to the form in which JSON keeps it; for a task, its identity."""
     return json.loads(json.dumps(value, default=_plain))
 
 
@@ -77,26 +77,28 @@ def _facts_of(search: Search, keep: Callable[[Any], str]) -> dict[str, Any]:
         **{name: getattr(probe, name) for name in numbers},
         **{name: getattr(search, name) for name in ("seed", "episodes", "rounds", "steps")},
         "random": search.random_state,
-        "controllers": [_facts_of_entrant(one, keep) for one in search.controllers],
-        "policies": [_facts_of_entrant(one, keep) for one in search.policies],
+        "controllers": [_facts_of_candidate_search(one, keep) for one in search.controllers],
+        "policies": [_facts_of_candidate_search(one, keep) for one in search.policies],
         "baseline": None if baseline is None else _place(baseline, search.controllers),
         "scale": keep(search.scale),
         "widths": search.widths,
     }
 
 
-def _place(entrant: Entrant, among: list[Entrant]) -> int:
-    return next(place for place, one in enumerate(among) if one is entrant)
+def _place(candidate_search: CandidateSearch, among: list[CandidateSearch]) -> int:
+    return next(place for place, one in enumerate(among) if one is candidate_search)
 
 
-def _facts_of_agent(agent: Agent | None, keep: Callable[[Any], str]) -> dict[str, Any] | None:
+def _facts_of_agent(
+    agent: ResidualAgent | None, keep: Callable[[Any], str]
+) -> dict[str, Any] | None:
     if agent is None:
         return None
     facts = {one.name: getattr(agent, one.name) for one in fields(agent)}
     return facts | {"weights": keep(agent.weights), "scale": keep(agent.scale)}
 
 
-def _facts_of_entrant(one: Entrant, keep: Callable[[Any], str]) -> dict[str, Any]:
+def _facts_of_candidate_search(one: CandidateSearch, keep: Callable[[Any], str]) -> dict[str, Any]:
     return {
         "cma": None if one.cma is None else _facts_of_cma(one.cma, keep),
         **{name: _facts_of_agent(getattr(one, name), keep) for name in ("make", "then", "best")},
@@ -117,10 +119,10 @@ def search_in(content: bytes) -> Search:
     """The search that a file holds.
 
     Args:
-        content: That of the file.
+        content: Content of the file.
 
     Raises:
-        Exception: Of any kind, if the file is damaged; see ``fmugym.errors.reading``.
+        Exception: Of any kind, if the file is damaged; see ``fmugym.errors.reading_file``.
     """
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
@@ -131,7 +133,7 @@ def search_in(content: bytes) -> Search:
 
 
 class _Reader:
-    """Makes objects of facts, and refuses those that cannot be.
+    """Reader of objects from their facts, which refuses impossible ones.
 
     Args:
         arrays: By name.
@@ -147,8 +149,10 @@ class _Reader:
             _count(facts[name], math.inf) for name in ("episodes", "rounds", "steps")
         )
         search.random_state = facts["random"]
-        search.controllers = [self._entrant(one, search) for one in _some(facts["controllers"])]
-        search.policies = [self._entrant(one, search) for one in facts["policies"]]
+        search.controllers = [
+            self._candidate_search(one, search) for one in _some(facts["controllers"])
+        ]
+        search.policies = [self._candidate_search(one, search) for one in facts["policies"]]
         place = facts["baseline"]
         search.baseline = None if place is None else search.controllers[_count(place)]
         search.scale = self._array(facts["scale"], 2, None)
@@ -168,11 +172,11 @@ class _Reader:
             usual_steps=_count(facts["usual_steps"], math.inf),
         )
 
-    def _agent(self, facts: Mapping[str, Any]) -> Agent:
+    def _agent(self, facts: Mapping[str, Any]) -> ResidualAgent:
         observed, acting, hidden = (_count(facts[n]) for n in ("observed", "acting", "hidden"))
         text = facts["text"]
         _require_controller(text)
-        agent = Agent(
+        agent = ResidualAgent(
             _kind(facts["name"], str),
             text,
             observed,
@@ -188,15 +192,15 @@ class _Reader:
             raise ValueError(f"{len(agent.weights)} weights, expected {agent.size}")
         return agent
 
-    def _optional_agent(self, facts: Mapping[str, Any] | None) -> Agent | None:
+    def _optional_agent(self, facts: Mapping[str, Any] | None) -> ResidualAgent | None:
         return None if facts is None else self._agent(facts)
 
-    def _entrant(self, facts: Mapping[str, Any], search: Search) -> Entrant:
+    def _candidate_search(self, facts: Mapping[str, Any], search: Search) -> CandidateSearch:
         make = self._optional_agent(facts["make"])
         size = 0 if make is None else _size_of(make)
         first, leader = facts["first"], facts["leader"]
         counts = {name: _count(facts[name], math.inf) for name in _COUNTS}
-        return Entrant(
+        return CandidateSearch(
             None if facts["cma"] is None else self._cma(facts["cma"], size, search),
             make,
             then=self._optional_agent(facts["then"]),
@@ -230,8 +234,8 @@ class _Reader:
         return array
 
 
-def _size_of(agent: Agent) -> int:
-    """How many numbers of an agent are sought."""
+def _size_of(agent: ResidualAgent) -> int:
+    """Number of sought numbers of an agent."""
     return len(search_of(agent.text).ranges) if has_range(agent.text) else agent.size
 
 

@@ -1,4 +1,4 @@
-"""Step responses of a task: what each action does to each observation in the end."""
+"""Step responses of a task: the final change of each observation by each action."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.arena import Arena
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
+from fmugym.baselines.controller import Controller
+from fmugym.pool.base import FloatArray
 
 __all__ = ["FEWEST", "StepResponses", "episodes_of", "step_test"]
 
-BoolArray = npt.NDArray[np.bool_]
+_BoolArray = npt.NDArray[np.bool_]
 
 _POINTS: Final = (0.25, 0.5, 0.75)
 """Operating points: all actions are at this part of their ranges."""
@@ -29,7 +30,7 @@ FEWEST: Final = 2 * _QUARTERS
 """A response of so many steps tells nothing."""
 
 _NOTHING: Final = 1e-6
-"""A response that is smaller than this part of what is observed is none."""
+"""A response below this part of the observed magnitude counts as none."""
 
 _AGREEMENT: Final = 0.5
 """The least ratio of the mean of all responses to that of their magnitudes; below it, the sign
@@ -52,10 +53,10 @@ _AT_ONCE: Final = 0.9
 
 @dataclass(frozen=True)
 class StepResponses:
-    """What k observations do if each of n actions is stepped.
+    """Responses of k observations to steps of n actions.
 
     Attributes:
-        names: Of the observations.
+        names: Names of the observations.
         responses: Differences to the unstepped twins, beside the step as a part of the action's
             range: of each of the steps of each action in the first step of an episode, and the
             means of the quarters of an episode; NaN if it is too short. Shape (s, n, 5, k).
@@ -70,21 +71,21 @@ class StepResponses:
 
     @cached_property
     def _means(self) -> FloatArray:
-        """Those of all steps, shape (5, k, n)."""
+        """Means of all steps, shape (5, k, n)."""
         known = np.isfinite(self.responses[..., :1, :1])
         count = np.maximum(known.sum(axis=0), 1)
         means: FloatArray = (np.where(known, self.responses, 0.0).sum(axis=0) / count).T
         return means.swapaxes(0, 1)
 
     @property
-    def _is_sure(self) -> BoolArray:
+    def _is_sure(self) -> _BoolArray:
         """Whether there is a response whose sign does not depend on the operating point."""
         last = np.nan_to_num(self.responses[:, :, -1])
         known = np.maximum(np.isfinite(self.responses[:, :, -1]).sum(axis=0), 1)
         magnitude = (np.abs(last).sum(axis=0) / known).T
         sizes = np.abs(self.ends).max(axis=0)[:, None]
         agrees = np.abs(self._means[-1]) >= _AGREEMENT * magnitude
-        sure: BoolArray = agrees & (magnitude > _NOTHING * sizes)
+        sure: _BoolArray = agrees & (magnitude > _NOTHING * sizes)
         return sure
 
     @property
@@ -117,15 +118,15 @@ class StepResponses:
         return [name for name, one in zip(self.names, away, strict=True) if one]
 
     @property
-    def is_instant(self) -> BoolArray:
-        """Which observations tell what an action is: they do not change later, shape (k,)."""
+    def is_instant(self) -> _BoolArray:
+        """Whether each observation follows an action at once and never after, shape (k,)."""
         first, last = np.abs(self._means[[0, -1]])
-        instant: BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
+        instant: _BoolArray = ((first >= _AT_ONCE * last) | ~self._is_sure).all(axis=1)
         return instant
 
 
 class _Held(Controller):
-    """Holds an action in each environment, and keeps what is observed."""
+    """Holds an action in each environment, and records observations."""
 
     def __init__(self, actions: FloatArray) -> None:
         self.actions = actions
@@ -141,51 +142,55 @@ class _Held(Controller):
         return np.ones((1, self.count))
 
     def course(self, length: int) -> FloatArray:
-        """What was observed in so many steps, shape (length, N, k); the last one is repeated."""
+        """Observations of so many steps, shape (length, N, k); the last one is repeated."""
         return np.stack([*self.rows, *self.rows[-1:] * (length - len(self.rows))])
 
 
 def episodes_of(actions: int) -> int:
-    """How many episodes the test of so many actions has."""
+    """Number of episodes of a test of so many actions."""
     return len(_POINTS) * (1 + 2 * actions)
 
 
-def step_test(arena: Arena, limits: Sequence[tuple[float, float]]) -> StepResponses:
+def step_test(
+    evaluator: CandidateEvaluator, limits: Sequence[tuple[float, float]]
+) -> StepResponses:
     """Step each action up and down at three operating points, beside an unstepped twin.
 
     All episodes have the same seed, so that noise and disturbances cancel in the differences. The
     actions are held from the beginning on.
 
     Args:
-        arena: Plays the episodes. They may be as long as ``arena.most_steps``.
-        limits: Those of each action.
+        evaluator: Plays the episodes. They may be as long as ``evaluator.most_steps``.
+        limits: Limits of each action.
     """
     count, (low, high) = len(limits), np.array(limits).T
     unit = np.eye(count)
     steps = np.concatenate([np.zeros((1, count)), unit, -unit])
     parts = np.concatenate([point + _STEP * steps for point in _POINTS])
-    names, courses = _played(arena, low + parts * (high - low))
+    names, courses = _played(evaluator, low + parts * (high - low))
     responses = []
     for first in range(0, len(courses), len(steps)):
         twin, *stepped = courses[first : first + len(steps)]
         found = np.array([_response(twin, one) / _STEP for one in stepped])
         responses += [found[:count], -found[count:]]
     ends = [one[-len(one) // _QUARTERS :].mean(axis=0) for one in courses]
-    early = np.mean([len(one) < arena.most_steps for one in courses])
+    early = np.mean([len(one) < evaluator.most_steps for one in courses])
     return StepResponses(names, np.array(responses), np.array(ends), bool(early > 0.5))
 
 
-def _played(arena: Arena, actions: FloatArray) -> tuple[tuple[str, ...], list[FloatArray]]:
-    """Play an episode with each action; returns what is observed, each of shape (T, k)."""
+def _played(
+    evaluator: CandidateEvaluator, actions: FloatArray
+) -> tuple[tuple[str, ...], list[FloatArray]]:
+    """Play an episode with each action; returns observations, each of shape (T, k)."""
     controllers: list[_Held] = []
     jobs = []
 
     def make(rows: FloatArray) -> Controller:
         controllers.append(_Held(rows))
-        jobs.append(arena.jobs)
+        jobs.append(evaluator.jobs)
         return controllers[-1]
 
-    lengths = arena.play(make, actions, [_SEED], has_moments=True).moments[:, 0, 0]
+    lengths = evaluator.play(make, actions, [_SEED], has_moments=True).moments[:, 0, 0]
     longest = max(len(one.rows) for one in controllers)
     rows = np.concatenate([one.course(longest) for one in controllers], axis=1)
     places = np.concatenate(jobs).tolist()

@@ -74,7 +74,7 @@ class _Panel:
     """A part of the picture with an axis of its own.
 
     Attributes:
-        label: What the axis shows.
+        label: Label of the axis.
         columns: The lines.
         setpoints: Set points of these.
         summed: Whether the lines are sums since the beginning of the episode.
@@ -87,7 +87,7 @@ class _Panel:
 
     @property
     def height(self) -> float:
-        """The height compared with that of a panel with one line."""
+        """Height as a multiple of the height of a panel with one line."""
         return 1.0 if self.summed or len(self.columns) == 1 else 1.4
 
 
@@ -177,7 +177,7 @@ def _times(series: TimeSeries) -> tuple[Any, str]:
 
 
 def _panels(series: TimeSeries) -> list[_Panel]:
-    """Group the columns by what can share an axis."""
+    """Group the columns that can share an axis."""
     setpoints = series.of_kind("setpoint")
     seen = [*series.of_kind("output", "memory", "expression", "observation")]
     targets = {column.name for column in seen}
@@ -194,7 +194,7 @@ def _panels(series: TimeSeries) -> list[_Panel]:
 
 
 def _by_unit(columns: Sequence[Quantity]) -> list[_Panel]:
-    """A panel for each unit; what has no unit shares an axis with nothing."""
+    """A panel for each unit; a column without a unit has a panel of its own."""
     groups: dict[str, list[Quantity]] = {}
     for column in columns:
         groups.setdefault(column.unit or f"\0{column.name}", []).append(column)
@@ -244,7 +244,7 @@ def _draw_legend(axis: Any) -> None:
 
 
 def _thinned(times: Any, values: Any) -> tuple[Any, Any]:
-    """Leave out what no picture shows: of many points near each other, all but two extremes."""
+    """Leave out points that a picture cannot show: of many near each other, two extremes stay."""
     if len(times) <= _MOST_POINTS:
         return times, values
     edges = np.linspace(0, len(times), _MOST_POINTS // 2 + 1).astype(int)
@@ -262,7 +262,7 @@ def _drawstyle(column: Quantity) -> str:
 
 
 def _draw_band(axis: Any, panel: _Panel, series: TimeSeries, times: Any) -> None:
-    """Fill what is between two set points of one variable."""
+    """Fill the area between two set points of one variable."""
     for column in panel.columns:
         own = [one for one in panel.setpoints if one.of == column.name]
         if len(own) == 2:

@@ -1,4 +1,4 @@
-"""Wrappers that write time series down while an environment is used."""
+"""Recorders: wrappers that write time series while an environment is used."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
-from fmugym.series.choice import Episodes, choose
-from fmugym.series.rows import Infos, Outcome, Rows, batched
-from fmugym.series.store import Memory, Store, open_store
+from fmugym.series.recorded_quantities import RecordedEnvs, choose
+from fmugym.series.rows import Infos, RecordedStep, RowMaker, batched_info
+from fmugym.series.store import MemoryStore, RowStore, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
 
@@ -26,7 +26,7 @@ __all__ = ["RecordSeries", "RecordVectorSeries"]
 
 
 class _Recorder:
-    """What both wrappers share.
+    """Common part of the two recorders.
 
     Args:
         episodes: The environments.
@@ -35,7 +35,7 @@ class _Recorder:
 
     def __init__(
         self,
-        episodes: Episodes,
+        episodes: RecordedEnvs,
         variables: str | Iterable[str] | None,
         environments: Iterable[int] | None,
         every: float | None,
@@ -49,8 +49,8 @@ class _Recorder:
         self._every = _steps_of(every, episodes.prototype.pool_spec.time_step)
         self._path = None if path is None else check_path("the path of a recording", path)
         self._most_rows = check_count("most_rows", most_rows)
-        self._memory: Memory | None = None
-        self._stores: list[Store] = []
+        self._memory: MemoryStore | None = None
+        self._stores: list[RowStore] = []
         self.has_begun = False
 
     def begin(self, mask: MaskArray, infos: Infos, observations: Any) -> None:
@@ -63,22 +63,22 @@ class _Recorder:
         if self.has_begun:
             return
         self.has_begun = True
-        self._rows = Rows(self.episodes, self._choice, self._indices, self._every, infos)
+        self._rows = RowMaker(self.episodes, self._choice, self._indices, self._every, infos)
         if steps is not None:
             self._rows.go_on(steps)
         if self._path is not None:
             self._stores.append(open_store(self._path, self._rows.none.columns))
             weakref.finalize(self, self._stores[0].close)
-        self._memory = Memory(self._rows.none, self._most_rows)
+        self._memory = MemoryStore(self._rows.none, self._most_rows)
         self._stores.append(self._memory)
 
-    def add(self, outcome: Outcome, idle: MaskArray, steps: Any) -> None:
+    def add(self, outcome: RecordedStep, idle: MaskArray, steps: Any) -> None:
         """Write down a step, before which episodes had so many steps, shape (N,)."""
         self._open(outcome.infos, steps)
         self._add(self._rows.add(outcome, idle))
 
     def present(self) -> FloatArray:
-        """What the environments have at this moment; see ``Choice.present``."""
+        """Present values of the environments; see ``RecordedQuantities.present``."""
         return self._choice.present(self.episodes, self._indices)
 
     def _add(self, rows: TimeSeries) -> None:
@@ -87,7 +87,7 @@ class _Recorder:
 
     @property
     def series(self) -> TimeSeries:
-        """What was written down until now."""
+        """Time series until now."""
         if self._memory is None:
             raise SimulationError("there is no recording before the first reset")
         rows: TimeSeries = self._memory.rows()
@@ -121,7 +121,7 @@ def _steps_of(every: float | None, time_step: float) -> int:
 
 
 class _One:
-    """A single environment, as ``Episodes``."""
+    """A single environment, as ``RecordedEnvs``."""
 
     is_vector = False
 
@@ -137,7 +137,7 @@ class _One:
 
 
 class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Writes down what an environment does, one row for each step.
+    """Recorder of an environment, which writes one row for each step.
 
     The first row of an episode is the moment after the reset. Rewards and costs in a row are those
     of the step that led to it.
@@ -176,7 +176,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def series(self) -> TimeSeries:
-        """What was written down until now.
+        """Time series until now.
 
         Raises:
             SimulationError: Before the first reset.
@@ -188,7 +188,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and write its first row; see ``FMUEnv.reset``."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._recorder.begin(np.array([True]), Infos(batched(info), 1), _batch(observation))
+        self._recorder.begin(np.array([True]), Infos(batched_info(info), 1), _batch(observation))
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -196,8 +196,8 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(action)
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
-        infos, seen = Infos(batched(info), 1), _batch(observation)
-        outcome = Outcome(np.array([float(reward)]), *flags, infos, seen)
+        infos, seen = Infos(batched_info(info), 1), _batch(observation)
+        outcome = RecordedStep(np.array([float(reward)]), *flags, infos, seen)
         self._recorder.add(outcome, no, self._recorder.episodes.prototype.step_count - 1)
         return observation, reward, terminated, truncated, info
 
@@ -216,7 +216,7 @@ def _batch(observation: Any) -> Any:
 
 
 class _Many:
-    """The environments of a vector environment, as ``Episodes``."""
+    """The environments of a vector environment, as ``RecordedEnvs``."""
 
     is_vector = True
 
@@ -233,7 +233,7 @@ class _Many:
 
 
 class RecordVectorSeries(VectorWrapper):
-    """Writes down what the environments of a vector environment do; see ``RecordSeries``.
+    """Recorder of a vector environment; see ``RecordSeries``.
 
     In the mode ``SAME_STEP``, an FMU is in its next episode when the step returns. The last row of
     an episode has the values at its end nevertheless: the recorder reads them within the step.
@@ -270,13 +270,13 @@ class RecordVectorSeries(VectorWrapper):
             env.look_at_ends(self._look)
 
     def _look(self, actions: Any) -> None:
-        """Read what environments have before the next episodes begin."""
+        """Read the values of environments before the next episodes begin."""
         self._envs.actions = np.array(actions)
         self._at_end = self._recorder.present()
 
     @property
     def series(self) -> TimeSeries:
-        """What was written down until now.
+        """Time series until now.
 
         Raises:
             SimulationError: Before the first reset.
@@ -325,7 +325,7 @@ class RecordVectorSeries(VectorWrapper):
         observations, rewards, terminated, truncated, infos = result
         self._envs.actions = np.array(actions)
         begun, ended, told = self._ended, terminated | truncated, Infos(infos, self.num_envs)
-        outcome = Outcome(rewards, terminated, truncated, told, observations)
+        outcome = RecordedStep(rewards, terminated, truncated, told, observations)
         if same_step := self._mode is AutoresetMode.SAME_STEP and ended.any():
             outcome = outcome._replace(**self._last(infos, observations, ended))
         self._recorder.add(outcome, begun, self._steps)
@@ -335,7 +335,7 @@ class RecordVectorSeries(VectorWrapper):
         return observations, rewards, terminated, truncated, infos
 
     def _last(self, infos: Any, observations: Any, ended: MaskArray) -> dict[str, Any]:
-        """With what episodes have ended, as an ``Outcome`` has it, in the mode SAME_STEP."""
+        """Last values of ended episodes in the mode SAME_STEP, as ``RecordedStep`` has them."""
         seen = observations
         if isinstance(observations, np.ndarray):
             seen = observations.copy()

@@ -92,9 +92,9 @@ def write_report(
 
     Args:
         path: A new file.
-        runs: What was recorded, by the name of the controller or agent. One is enough.
+        runs: Recorded episodes, by the name of the controller or agent. One is enough.
         title: The heading.
-        description: What the task is about.
+        description: Description of the task.
         facts: More to know, by name: the FMU, versions.
         text: The task, as its file has it.
         charts: More pictures, by their headings: SVG elements, as ``Figure.savefig`` of Matplotlib
@@ -141,7 +141,7 @@ def _body(
 def _results(
     found: Mapping[str, Sequence[EpisodeSummary]], runs: Mapping[str, TimeSeries]
 ) -> Iterator[str]:
-    """The table of means, and that of all episodes if there are several of a run."""
+    """Tables of the means, and of all episodes if a run has several."""
     rows = [(name, one) for name, episodes in found.items() for one in episodes]
     limits = {k: limit for series in runs.values() for k, limit in series.cost_limits.items()}
     figures = _Figures([one for _, one in rows], limits)
@@ -185,7 +185,7 @@ class _Figures:
             self.header.append(f"{name} (at most {limit:g})" if limit < math.inf else name)
 
     def cells(self, one: EpisodeSummary, kind: str = "") -> Iterator[str]:
-        """The cells of one row; the kind is that of its reward."""
+        """Cells of a row, of the kind of its reward."""
         yield _cell(_number(one.reward), kind)
         for column, limit in self._limits.items():
             value = one.figures.get(column, math.nan)
@@ -210,14 +210,14 @@ def _means(found: Mapping[str, Sequence[EpisodeSummary]], figures: _Figures) -> 
 
 
 def _gains(run: Sequence[EpisodeSummary], first: Sequence[EpisodeSummary]) -> list[float]:
-    """How much more reward the episodes of a run have brought than those of the first run."""
+    """Rewards of a run's episodes, less the rewards of the same ones of the first run."""
     rewards = {(one.environment, one.episode): one.reward for one in first if run is not first}
     pairs = [(one.reward, rewards.get((one.environment, one.episode))) for one in run]
     return [reward - other for reward, other in pairs if other is not None]
 
 
 def _mean(episodes: Sequence[EpisodeSummary]) -> EpisodeSummary:
-    """The means of rewards, costs and KPIs, where episodes have them."""
+    """Means of rewards, costs and KPIs over the episodes that have them."""
     return replace(
         episodes[0],
         reward=fmean(one.reward for one in episodes),

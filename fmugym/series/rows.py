@@ -1,4 +1,4 @@
-"""From the results of steps to rows of time series, for one environment or N of them."""
+"""Rows of time series, made of the results of steps of one environment or N."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.series.choice import Choice, Episodes
+from fmugym.series.recorded_quantities import RecordedEnvs, RecordedQuantities
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 from fmugym.task.starting import start_time_of
 
-__all__ = ["Infos", "Outcome", "Rows", "batched"]
+__all__ = ["Infos", "RecordedStep", "RowMaker", "batched_info"]
 
 _GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
 _TOLD: Final = {"kpis": "kpi", "proposed": "proposal", "predicted": "prediction"}
@@ -44,21 +44,23 @@ class Infos(NamedTuple):
         return [name for name in self.of_envs.get(group, ()) if not name.startswith("_")]
 
     def numbers(self, *path: str) -> FloatArray:
-        """The numbers at a place in the infos, shape (N,); 0 where there are none."""
+        """Numbers under a key of the infos, shape (N,); 0 for environments without one."""
         now = _numbers(self.of_envs, path, self.num_envs)
         last = _numbers(self.last, path, self.num_envs) if self.last else now
         return np.where(self.ended, last, now)
 
     def each(self, name: str) -> dict[int, Any]:
-        """The values of those environments that have one."""
+        """Values under a key, for the environments that have one."""
         ended = {*np.flatnonzero(self.ended).tolist()}
         now = {i: one for i, one in _each(self.of_envs, name).items() if i not in ended}
         return now | _each(self.last, name)
 
 
-def batched(info: Mapping[str, Any]) -> dict[str, Any]:
-    """The info of a single environment, as a vector environment of one gives it."""
-    values = {n: batched(one) if isinstance(one, Mapping) else [one] for n, one in info.items()}
+def batched_info(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert the info of a single environment to the infos of a vector environment of one."""
+    values = {
+        n: batched_info(one) if isinstance(one, Mapping) else [one] for n, one in info.items()
+    }
     return values | {f"_{name}": [True] for name in info}
 
 
@@ -84,15 +86,16 @@ def _one(values: Any, index: int) -> Any:
     return values[index]
 
 
-class Outcome(NamedTuple):
-    """What a step of N environments has given.
+class RecordedStep(NamedTuple):
+    """Results of a step of N environments.
 
     Attributes:
         rewards, terminated, truncated: Shape (N,).
         infos: The infos of the steps, those of steps that ended an episode included.
         observations: Likewise.
-        last: What environments had whose FMU is in the next episode already (``infos.ended``), a
-            row for each that is written down, as ``Choice.present`` gives it; None without such.
+        last: The last rows of environments whose FMU is in the next episode already
+            (``infos.ended``), one for each that is written down, as ``RecordedQuantities.present``
+            gives it; None without such.
     """
 
     rewards: FloatArray
@@ -103,8 +106,8 @@ class Outcome(NamedTuple):
     last: FloatArray | None = None
 
 
-class Rows:
-    """Makes rows of what environments do.
+class RowMaker:
+    """Maker of rows from the steps of environments.
 
     Args:
         episodes: The environments.
@@ -112,7 +115,7 @@ class Rows:
         indices: The environments to write down.
         every: The number of steps from one row to the next. Rewards and costs in a row are the sums
             since the row before.
-        infos: Those of the first reset, which tell the terms of rewards and costs.
+        infos: Infos of the first reset, which tell the terms of rewards and costs.
 
     Attributes:
         none: No rows, with the columns of all that follow.
@@ -120,8 +123,8 @@ class Rows:
 
     def __init__(
         self,
-        episodes: Episodes,
-        choice: Choice,
+        episodes: RecordedEnvs,
+        choice: RecordedQuantities,
         indices: npt.NDArray[np.intp],
         every: int,
         infos: Infos,
@@ -167,11 +170,11 @@ class Rows:
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations, infos), (no, no), infos)
 
-    def add(self, outcome: Outcome, idle: MaskArray) -> TimeSeries:
+    def add(self, outcome: RecordedStep, idle: MaskArray) -> TimeSeries:
         """Make the rows of a step.
 
         Args:
-            outcome: What the step has given.
+            outcome: Results of the step.
             idle: The environments that did not step.
         """
         terms = [outcome.infos.numbers(*path) for path in self._summed]
@@ -189,7 +192,7 @@ class Rows:
         return block
 
     def _values(self, observations: Any, infos: Infos) -> FloatArray:
-        """What they have, and what they observe; not what a plant has failed to tell."""
+        """Values and observations of the environments; a plant may lack some values."""
         seen = self._choice.seen(observations, self._indices)
         now = self._choice.present(self._episodes, self._indices)
         values = np.concatenate([now, seen], axis=1)

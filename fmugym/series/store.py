@@ -1,4 +1,4 @@
-"""Where the rows of a recorder go: memory, a CSV file, a Parquet file."""
+"""Stores for the rows of a recorder: memory, a CSV file, a Parquet file."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from fmugym.task.quantity import Quantity
 __all__ = [
     "FAULT",
     "WHOLE",
-    "Memory",
-    "Store",
+    "MemoryStore",
+    "RowStore",
     "heading",
     "open_store",
 ]
@@ -34,7 +34,7 @@ _ROWS_OF_A_GROUP: Final = 20_000
 """Rows that a Parquet file gets at once."""
 
 
-class Store(Protocol):
+class RowStore(Protocol):
     """Takes rows, in the form of a ``TimeSeries``."""
 
     def add(self, rows: Any) -> None:
@@ -44,7 +44,7 @@ class Store(Protocol):
         """Add no more rows; more than one call is fine."""
 
 
-def open_store(path: Path, columns: Sequence[Quantity]) -> Store:
+def open_store(path: Path, columns: Sequence[Quantity]) -> RowStore:
     """Make a store that writes a new file, of the format that its name tells.
 
     Raises:
@@ -58,7 +58,7 @@ def open_store(path: Path, columns: Sequence[Quantity]) -> Store:
     return kind(path, columns)
 
 
-class Memory:
+class MemoryStore:
     """Keeps the latest rows in memory.
 
     Args:
@@ -104,7 +104,7 @@ class CsvStore:
         self._writer.writerow([*map(heading, columns), FAULT])
 
     def add(self, rows: Any) -> None:
-        """See ``Store``."""
+        """See ``RowStore``."""
         columns = [cells.tolist() for cells in rows.cells()]
         for number, row in enumerate(zip(*columns, strict=True)):
             cells = ["" if cell != cell else cell for cell in row]  # no NaN
@@ -118,7 +118,7 @@ class CsvStore:
             raise
 
     def close(self) -> None:
-        """See ``Store``."""
+        """See ``RowStore``."""
         self._file.close()
 
 
@@ -140,7 +140,7 @@ class ParquetStore:
         return self._arrow.field(column.name, self._arrow.type_for_alias(kind), metadata=facts)
 
     def add(self, rows: Any) -> None:
-        """See ``Store``."""
+        """See ``RowStore``."""
         self._waiting.append(rows)
         self._rows += len(rows)
         if self._rows >= _ROWS_OF_A_GROUP:
@@ -155,7 +155,7 @@ class ParquetStore:
         self._writer.write_table(self._arrow.table(table, schema=self._schema))
 
     def close(self) -> None:
-        """See ``Store``."""
+        """See ``RowStore``."""
         if not self._file.closed:
             if self._waiting:
                 self._write()

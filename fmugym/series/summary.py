@@ -23,7 +23,7 @@ class EpisodeSummary:
 
     Attributes:
         environment, episode: Their numbers.
-        steps: How many steps it had.
+        steps: Number of its steps.
         seconds: The simulated time.
         reward: The total reward.
         figures: The totals of its terms and of costs, and the KPIs of the task, by their columns.
@@ -68,7 +68,7 @@ def _figure(values: Any, column: Quantity) -> float:
 
 
 def courses(series: TimeSeries) -> Iterator[tuple[Quantity, tuple[float | None, ...]]]:
-    """Sum up the course of variables in an episode; those without any value are left out.
+    """Summarize each variable over an episode, without variables that never have a value.
 
     Yields:
         The variable; its least, mean, greatest and last value, and the mean absolute difference

@@ -23,7 +23,7 @@ __all__ = ["TimeSeries"]
 
 @dataclass(frozen=True)
 class TimeSeries:
-    """What a recorder has written down, one row for each moment.
+    """Table that a recorder has written, one row for each moment.
 
     Attributes:
         columns: What the columns are. Beside the kinds of ``fmugym.task.quantity``, there are
@@ -32,7 +32,7 @@ class TimeSeries:
             ``"flag"`` (terminated, truncated).
         values: Shape (rows, columns).
         faults: The reasons of faults by row.
-        cost_limits: What the costs of an episode may add up to, by name.
+        cost_limits: Limits of the costs of an episode, by name.
     """
 
     columns: tuple[Quantity, ...]
@@ -61,7 +61,7 @@ class TimeSeries:
 
     @property
     def units(self) -> dict[str, str]:
-        """The units by name, where they are known."""
+        """Known units by name."""
         return {column.name: column.unit for column in self.columns if column.unit}
 
     def episodes(self) -> dict[tuple[int, int], TimeSeries]:

@@ -1,1 +1,1 @@
-"""Surrogates: what an FMU has done, as a program of expressions that steps in its place."""
+"""Surrogates: programs of expressions, fitted to episodes of an FMU, that step in its place."""

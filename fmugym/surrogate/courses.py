@@ -1,4 +1,4 @@
-"""What an FMU has done: the courses of its episodes, and a pool that keeps them."""
+"""Courses of an FMU: trajectories of its episodes, and a pool that keeps them."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ __all__ = ["Course", "Courses", "RecordingPool"]
 
 
 class Course(NamedTuple):
-    """An episode of an FMU, or its beginning.
+    """Trajectory of an episode of an FMU, or of its beginning.
 
     Attributes:
         starts: The values set before initialization, shape (p,).
-        inputs: Those of T steps, shape (T, m).
-        outputs: Those at the start and after each step, shape (T + 1, k).
+        inputs: Inputs of T steps, shape (T, m).
+        outputs: Outputs at the start and after each step, shape (T + 1, k).
     """
 
     starts: FloatArray
@@ -34,17 +34,17 @@ class Course(NamedTuple):
 
     @property
     def steps(self) -> int:
-        """How many there are."""
+        """Number of steps."""
         return len(self.inputs)
 
 
 class Courses:
-    """The courses of an FMU. Given as the ``backend`` of environments, it keeps what they play.
+    """Courses of an FMU; as the ``backend`` of environments, the object keeps their episodes.
 
     Attributes:
-        spec: What the pools do at each step; None before there is one.
-        variables: What is set before initialization, P of them.
-        steps: Those of all instances, warm-ups included.
+        spec: Specification of a step; None before there is one.
+        variables: P variables that are set before initialization.
+        steps: Steps of all instances, warm-ups included.
     """
 
     spec: PoolSpec | None = None
@@ -68,7 +68,7 @@ class Courses:
         return self._open[-1]
 
     def all(self) -> list[Course]:
-        """Those until now, also those without a step."""
+        """All courses until now, also the ones without a step."""
         width = 0 if self.spec is None else len(self.spec.inputs)
         return [
             Course(starts, np.reshape(inputs, (len(inputs), width)), np.array(outputs))
@@ -77,7 +77,7 @@ class Courses:
 
 
 class _Open(NamedTuple):
-    """A course that goes on."""
+    """Course of an episode that is not over."""
 
     starts: FloatArray
     inputs: list[FloatArray]
@@ -85,12 +85,12 @@ class _Open(NamedTuple):
 
 
 class RecordingPool(Pool):
-    """A pool whose courses are kept.
+    """Pool that keeps the courses of another pool.
 
     Args:
         pool: Steps the FMU.
-        spec: What it does at each step.
-        courses: Where they are kept.
+        spec: Specification of a step.
+        courses: Collection of the courses.
     """
 
     def __init__(self, pool: Pool, spec: PoolSpec, courses: Courses) -> None:

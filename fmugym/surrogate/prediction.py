@@ -1,4 +1,4 @@
-"""Predictions: a surrogate beside the FMU, in episodes that its fit has not seen."""
+"""Predictions by a surrogate, compared with the FMU in episodes that the fit has not seen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course
 from fmugym.surrogate.surrogate import Surrogate
-from fmugym.surrogate.terms import rows_of, simulated
+from fmugym.surrogate.terms import regressors_of, simulated
 
 if TYPE_CHECKING:
     from fmugym.figures import Figure
@@ -29,7 +29,7 @@ class Prediction(NamedTuple):
 
     Attributes:
         course: An episode of the FMU.
-        outputs: What the surrogate predicts of it from its beginning on, shape (T + 1, k).
+        outputs: Outputs that the surrogate predicts from its beginning on, shape (T + 1, k).
         errors: The root mean square error of predictions that begin everywhere in the episodes,
             by the number of their steps, shape (h, k).
         spread: The standard deviation of the outputs in the episodes, shape (k,).
@@ -42,15 +42,15 @@ class Prediction(NamedTuple):
 
 
 def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
-    """Let a surrogate predict episodes from the FMU's inputs and from where they begin.
+    """Predict episodes by a surrogate, from the FMU's inputs and first outputs.
 
     Args:
         surrogate: The surrogate.
-        courses: Those of the FMU, each with a step at least; the longest one is shown.
+        courses: Courses of the FMU, each with a step at least; the longest one is shown.
     """
     terms, bounds = surrogate.terms, (surrogate.low, surrogate.high)
     longest = max(courses, key=lambda one: one.steps)
-    rows = rows_of(terms.form, longest)[:, None]
+    rows = regressors_of(terms.form, longest)[:, None]
     after = [*simulated(terms, [surrogate.weights.T], bounds, rows)]
     outputs = np.concatenate([longest.outputs[:1], np.array(after)[:, :, 0]])
     horizon = max(1, longest.steps // _PART)
@@ -63,7 +63,7 @@ def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
 def _squares(surrogate: Surrogate, course: Course, horizon: int) -> FloatArray:
     """The squared errors of predictions from each step on, shape (horizon, n, k)."""
     begins = range(course.steps - horizon + 1)
-    rows = rows_of(surrogate.terms.form, course)
+    rows = regressors_of(surrogate.terms.form, course)
     windows = np.stack([rows[:, one : one + horizon] for one in begins], axis=1)
     true = np.stack([course.outputs[one + 1 :][:horizon] for one in begins], axis=1)
     bounds = surrogate.low, surrogate.high

@@ -1,4 +1,4 @@
-"""The outputs with which episodes begin, from what is set before initialization."""
+"""Outputs at the start of episodes, as functions of the values that are set before."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _BEYOND: Final = 0.5
 
 @dataclass(frozen=True)
 class Start:
-    """The outputs at the start of an episode, as a sum of terms of what is set before.
+    """Outputs at the start of an episode, as a sum of terms of the start values.
 
     Attributes:
         names: The variables that are set.
-        mean, deviation: What their values are like, shape (p,).
+        mean, deviation: Mean and standard deviation of their values, shape (p,).
         low, high: The range of the outputs, shape (k,).
-        weights: Those of the terms, shape (k, f).
+        weights: Weights of the terms, shape (k, f).
     """
 
     names: tuple[str, ...]
@@ -62,7 +62,7 @@ class Start:
         return np.concatenate([ones, scaled, scaled[first] * scaled[second]])
 
     def values(self, given: Sequence[Value]) -> list[Value]:
-        """The outputs as values of a graph, from those of what is set."""
+        """Outputs as values of a graph, from the start values."""
         scaled = [
             (one - mean) * (1.0 / deviation)
             for one, mean, deviation in zip(given, self.mean, self.deviation, strict=True)

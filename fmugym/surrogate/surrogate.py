@@ -25,18 +25,18 @@ __all__ = ["Surrogate"]
 
 @dataclass(frozen=True)
 class Surrogate:
-    """What an FMU does in a step, fitted to its courses.
+    """Model of a step of an FMU, fitted to its courses.
 
     Given as the ``backend`` of environments, it steps in the place of the FMU.
 
     Attributes:
-        terms: What the changes of outputs are sums of.
-        weights: Those of the terms, shape (k, f).
+        terms: Terms of the changes of outputs.
+        weights: Weights of the terms, shape (k, f).
         low, high: The range in which outputs stay, shape (k,).
         start: The outputs with which episodes begin.
-        error: That of simulations which the fit has not seen, beside the spread of the outputs.
-        spec: What the FMU did at each step.
-        variables: What was set before initialization, P of them.
+        error: Error of simulations which the fit has not seen, beside the spread of the outputs.
+        spec: Specification of a step.
+        variables: P variables that are set before initialization.
     """
 
     terms: Terms
@@ -85,7 +85,7 @@ class Surrogate:
         return found
 
     def runs(self, rows: FloatArray, after: FloatArray) -> Callable[[], None]:
-        """A function that reads what a step depends on, and writes the outputs after it.
+        """Make a function from regressors of a step to the outputs after it.
 
         Args:
             rows: Shape (d, N).
@@ -112,7 +112,7 @@ class Surrogate:
         return run
 
     def next_outputs(self, row: Sequence[Value]) -> list[Value]:
-        """The outputs after the step, from what it depends on."""
+        """Outputs after the step, from its regressors."""
         factors = self.terms.factors(row)
         return [
             self._next(place, row[place], factors, weights)

@@ -14,7 +14,7 @@ from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course, Courses
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.surrogate import Surrogate
-from fmugym.surrogate.terms import Form, Terms, rows_of, simulated
+from fmugym.surrogate.terms import SurrogateForm, Terms, regressors_of, simulated
 
 __all__ = ["fit"]
 
@@ -59,7 +59,7 @@ def fit(courses: Courses) -> Surrogate:
 
 
 class _Data:
-    """The courses, and which of them each fold leaves out."""
+    """Courses of a fit, and the courses that each fold leaves out."""
 
     def __init__(self, courses: Courses) -> None:
         spec = courses.spec
@@ -69,7 +69,7 @@ class _Data:
         self.courses, self.spec = courses, spec
         self.widths = len(spec.outputs), len(spec.inputs)
         angles = [i for i, one in enumerate(spec.outputs) if one.unit == "rad"]
-        self.linear = Form(angles=tuple(angles))
+        self.linear = SurrogateForm(angles=tuple(angles))
         changes = np.concatenate([np.diff(one.outputs, axis=0) for one in self.all])
         size = changes.std(axis=0)
         self.size = np.where(size > 0.0, size, 1.0)
@@ -81,14 +81,14 @@ class _Data:
         self.at_an_end = (after == self.ends[0]) | (after == self.ends[1])
         self.horizon = max(1, min(_HORIZON, max(one.steps for one in self.all) // 4))
 
-    def bounds(self, form: Form) -> tuple[FloatArray, FloatArray]:
-        """Between what outputs stay: near their ranges, or exactly where these limit them."""
+    def bounds(self, form: SurrogateForm) -> tuple[FloatArray, FloatArray]:
+        """Bounds of outputs: a little beyond their ranges; limited outputs stay within theirs."""
         low, high = self.ends
         beyond = _BEYOND * (high - low)
         beyond[[*form.limited]], beyond[[*form.angles]] = 0.0, np.inf
         return low - beyond, high + beyond
 
-    def extensions(self, form: Form) -> Iterator[Form]:
+    def extensions(self, form: SurrogateForm) -> Iterator[SurrogateForm]:
         """The forms that have one thing more."""
         if form.lags < min(_LAGS, self.horizon - 1):
             yield replace(form, lags=form.lags + 1)
@@ -108,14 +108,16 @@ class _Data:
 
     # The fit of one form.
 
-    def _matrices(self, form: Form, courses: Sequence[Course]) -> tuple[FloatArray, FloatArray]:
+    def _matrices(
+        self, form: SurrogateForm, courses: Sequence[Course]
+    ) -> tuple[FloatArray, FloatArray]:
         first = form.lags  # before this step, what a course begins with does not tell its past
-        rows = np.concatenate([rows_of(form, one)[:, first:] for one in courses], axis=1)
+        rows = np.concatenate([regressors_of(form, one)[:, first:] for one in courses], axis=1)
         changes = np.concatenate([np.diff(one.outputs, axis=0)[first:] for one in courses])
         return rows, changes / self.size
 
     def _weights(
-        self, form: Form, courses: Sequence[Course], penalties: Sequence[float]
+        self, form: SurrogateForm, courses: Sequence[Course], penalties: Sequence[float]
     ) -> tuple[Terms, list[FloatArray]]:
         """The terms, and for each penalty the weights, shape (f, k)."""
         rows, changes = self._matrices(form, courses)
@@ -133,27 +135,27 @@ class _Data:
                 found[number, :, place] = np.linalg.solve(square + ridge, right) * self.size[place]
         return terms, [*found]
 
-    def trial(self, form: Form) -> tuple[float, float]:
+    def trial(self, form: SurrogateForm) -> tuple[float, float]:
         """The smallest mean error of simulations, and the penalty that has it."""
         errors = np.array([self._fold(form, number) for number in range(_FOLDS)])
         mean = np.nan_to_num(errors, nan=np.inf).mean(axis=0)
         return float(mean.min()), _PENALTIES[int(mean.argmin())]
 
-    def _fold(self, form: Form, number: int) -> FloatArray:
+    def _fold(self, form: SurrogateForm, number: int) -> FloatArray:
         """The error of each penalty in the courses of one fold."""
         kept, left = self._split(number)
         terms, weights = self._weights(form, kept, _PENALTIES)
-        return simulation_errors(terms, weights, left, self.horizon, self)
+        return _simulation_errors(terms, weights, left, self.horizon, self)
 
     def _split(self, number: int) -> tuple[list[Course], list[Course]]:
-        """The courses of a fit, and those that it does not see."""
+        """Courses of a fit, and courses for its test."""
         long = [one for one in self.all if one.steps >= self.horizon] or self.all
         pieces = self.all if len(long) >= 2 * _FOLDS else list(_pieces(self.all, 2 * self.horizon))
         left = [one for place, one in enumerate(pieces) if place % _FOLDS == number]
         kept = [one for place, one in enumerate(pieces) if place % _FOLDS != number]
         return kept or pieces, left or pieces
 
-    def _threshold(self, form: Form) -> tuple[int, float] | None:
+    def _threshold(self, form: SurrogateForm) -> tuple[int, float] | None:
         """The threshold of an input that explains most of a step, beside linear terms."""
         small = replace(form, tanhs=0, quadratic=False)
         rows, changes = self._matrices(small, self.all)
@@ -174,7 +176,7 @@ class _Data:
                 low, high = float(grid[least]), float(grid[least + 2])
         return None if best[0] == np.inf else best[1:]
 
-    def fitted(self, form: Form, error: float, penalty: float) -> Surrogate:
+    def fitted(self, form: SurrogateForm, error: float, penalty: float) -> Surrogate:
         """The surrogate of a form, fitted to all courses."""
         terms, (weights,) = self._weights(form, self.all, [penalty])
         start = Start.of(self.courses.variables, self.courses.all())
@@ -184,7 +186,7 @@ class _Data:
 
 
 def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:
-    """What terms leave of the changes, shape (n, k)."""
+    """Residuals of the changes, shape (n, k)."""
     both = np.concatenate([values, more])
     square = both @ both.T + 1e-6 * both.shape[1] * np.eye(len(both))
     weights = np.linalg.solve(square, both @ changes)
@@ -198,7 +200,7 @@ def _pieces(courses: Sequence[Course], steps: int) -> Iterator[Course]:
             yield Course(starts, inputs[begin : begin + steps], outputs[begin : begin + steps + 1])
 
 
-def simulation_errors(
+def _simulation_errors(
     terms: Terms, weights: Sequence[FloatArray], courses: Sequence[Course], horizon: int, data: Any
 ) -> FloatArray:
     """The root mean square error of outputs in simulations, for each set of weights.
@@ -208,7 +210,10 @@ def simulation_errors(
     """
     horizon = min(horizon, max(one.steps for one in courses))
     windows = [
-        (rows_of(terms.form, one)[:, begin : begin + horizon], one.outputs[begin + 1 :][:horizon])
+        (
+            regressors_of(terms.form, one)[:, begin : begin + horizon],
+            one.outputs[begin + 1 :][:horizon],
+        )
         for one in courses
         for begin in range(0, one.steps - horizon + 1, max(1, horizon // 2))
     ]

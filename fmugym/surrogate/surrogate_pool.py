@@ -33,11 +33,11 @@ class SurrogatePool(CountedPool):
     """N instances of a surrogate.
 
     Args:
-        terms: What a step depends on.
-        start: How episodes begin.
+        terms: Terms of the changes of outputs.
+        start: Outputs at the start of episodes.
         prepare: Makes a function that computes outputs; see ``Surrogate.runs``.
         fmu: Describes the variables; closed with the pool.
-        spec: What to do at each reset and step.
+        spec: Specification of a reset and step.
         num_instances: N.
     """
 
@@ -80,7 +80,7 @@ class SurrogatePool(CountedPool):
         return self.outputs, self.statuses
 
     def _places_in(self, variables: tuple[Variable, ...]) -> list[int]:
-        """The places among variables of those that were set in the courses.
+        """Places of the variables that were set in the courses.
 
         Raises:
             SimulationError: If others are set, too: nobody knows what they change.
@@ -122,7 +122,7 @@ class SurrogatePool(CountedPool):
         self._is_first &= ~wanted
 
     def _keep(self, wanted: MaskArray) -> None:
-        """Let the outputs be those after the step."""
+        """Take the outputs after the step."""
         rows, count, end = self._rows, self._outputs, self._first_input
         if self._lags:
             older = rows[count : end - count].copy()

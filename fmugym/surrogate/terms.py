@@ -1,4 +1,4 @@
-"""The forms of surrogates: of what the change of outputs in a step is a sum."""
+"""Terms of surrogates, whose weighted sum is the change of the outputs in a step."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from fmugym.expressions.value import Value, where
 from fmugym.pool.base import FloatArray
 from fmugym.surrogate.courses import Course
 
-__all__ = ["Form", "Terms", "rows_in", "rows_of", "simulated"]
+__all__ = ["SurrogateForm", "Terms", "regressors_of", "rows_in", "simulated"]
 
 _BEYOND: Final = 0.2
 """Numbers are clipped to their range in the courses, which is so much wider on both sides."""
 
 _STEEPNESS: Final = 1.5
-"""The root mean square of what is in a tanh."""
+"""Root mean square of the argument of a tanh."""
 
 Number = Callable[[float], Any]
 
 
 @dataclass(frozen=True)
-class Form:
-    """What the change of an output depends on.
+class SurrogateForm:
+    """Form of a surrogate: the regressors and terms of the changes of outputs.
 
     Attributes:
         lags: How many earlier outputs and inputs it depends on, beside the present ones.
@@ -55,13 +55,13 @@ class Form:
         words += [f"{len(self.limited)} limited"] * bool(self.limited)
         return ", ".join(words)
 
-    def with_threshold(self, place: int, value: float) -> Form:
+    def with_threshold(self, place: int, value: float) -> SurrogateForm:
         """The form with another threshold of an input."""
         return replace(self, thresholds=(*self.thresholds, (place, value)))
 
 
-def rows_of(form: Form, course: Course) -> FloatArray:
-    """What the steps of a course depend on, shape (d, T).
+def regressors_of(form: SurrogateForm, course: Course) -> FloatArray:
+    """Regressors of the steps of a course, shape (d, T).
 
     These are the outputs, their changes in earlier steps, the inputs, their changes, and the
     values set before initialization. Before an episode, nothing has changed.
@@ -88,12 +88,12 @@ class Terms:
     Attributes:
         form: The form.
         widths: How many outputs and inputs there are.
-        mean, deviation, low, high: Those of what steps depend on, shape (d,).
+        mean, deviation, low, high: Statistics of the regressors, shape (d,).
         mixing: The weights in each tanh, and a constant, shape (tanhs, factors + 1).
         pairs: The factors of each product, shape (2, q).
     """
 
-    form: Form
+    form: SurrogateForm
     widths: tuple[int, int]
     mean: FloatArray
     deviation: FloatArray
@@ -103,8 +103,8 @@ class Terms:
     pairs: Any = field(init=False)
 
     @classmethod
-    def of(cls, form: Form, rows: FloatArray, widths: tuple[int, int]) -> Terms:
-        """The terms, scaled by rows as ``rows_of`` gives them."""
+    def of(cls, form: SurrogateForm, rows: FloatArray, widths: tuple[int, int]) -> Terms:
+        """The terms, scaled by rows as ``regressors_of`` gives them."""
         low, high = rows.min(axis=1), rows.max(axis=1)
         beyond = _BEYOND * (high - low)
         deviation = rows.std(axis=1)
@@ -130,16 +130,16 @@ class Terms:
 
     @property
     def count(self) -> int:
-        """How many terms there are."""
+        """Number of terms."""
         return 1 + self.factor_count + int(self.pairs.shape[1])
 
     @property
     def factor_count(self) -> int:
-        """How many factors there are."""
+        """Number of factors."""
         return int(self.mixing.shape[1]) - 1 + len(self.mixing) + len(self.form.thresholds)
 
     def _scaled(self, row: Sequence[Any], number: Number = float) -> list[Value]:
-        """The factors that are scaled numbers; what is constant in the courses is none."""
+        """Factors that are scaled numbers, without numbers that are constant in the courses."""
         outputs = self.widths[0]
         found: list[Value] = []
         for place, value in enumerate(row):
@@ -152,7 +152,7 @@ class Terms:
         return found
 
     def factors(self, row: Sequence[Value], number: Number = float) -> list[Value]:
-        """All factors, of what a step depends on.
+        """All factors of the regressors of a step.
 
         Args:
             row: Its values.
@@ -211,11 +211,11 @@ def simulated(
     """Simulate by numpy, from places in courses on.
 
     Args:
-        terms: What a step depends on.
+        terms: Terms of the changes of outputs.
         weights: Sets of weights, each of shape (f, k).
         bounds: Between what outputs stay, each of shape (k,).
-        rows: As of ``rows_of``, of n simulations, shape (d, n, steps): the first ones tell where
-            they begin, and all tell the inputs.
+        rows: As of ``regressors_of``, of n simulations, shape (d, n, steps): the first ones tell
+            where they begin, and all tell the inputs.
 
     Yields:
         The outputs after each step, shape (k, sets * n).

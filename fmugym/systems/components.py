@@ -84,7 +84,7 @@ class OpenComponent:
 
     Args:
         name: Its name in the system.
-        given: What the user gave.
+        given: Values that the user gave.
 
     Attributes:
         name, given: As given.
@@ -154,17 +154,17 @@ class OpenComponent:
 
     @property
     def feedthrough(self) -> Feedthrough:
-        """Which inputs act on which outputs at once."""
+        """Direct feed-through: the inputs that act at once on each output."""
         told = self.fmu.feedthrough
         if self.given.feedthrough is None:
             return told
         nothing: dict[str, frozenset[str]] = dict.fromkeys(told.in_step, frozenset())
         return Feedthrough(nothing, nothing, known=True)
 
-    def planned(self) -> system_plan.Component:
+    def planned(self) -> system_plan.ComponentPlan:
         """The component as the master executes it."""
         limits, preload = self.fmu.limits, self.fmu.preload
-        return system_plan.Component(
+        return system_plan.ComponentPlan(
             self.name,
             self.fmu.path,
             self.fmu.interface,

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from fmugym.checks import KnownArguments, check_number, check_text
 from fmugym.errors import ConfigError, shown
-from fmugym.keys import FLAG, NUMBER, TEXT, Either, Kind, check_fields, key, table_of
+from fmugym.keys import FLAG, NUMBER, TEXT, Either, Kind, check_fields, key, table_of_fields
 
 __all__ = ["CONNECTION", "Connection"]
 
@@ -74,7 +74,7 @@ class Connection(KnownArguments):
 
 
 CONNECTION: Final = Either(
-    table_of(Connection, make=Connection),
+    table_of_fields(Connection, make=Connection),
     Kind(lambda _, value: Connection.of(value), {"title": '"source -> target"', **TEXT.schema}),
 )
 """A connection as a text or pair of names, a table or an object."""

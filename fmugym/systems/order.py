@@ -14,13 +14,13 @@ from typing import TypeVar
 from fmugym.archive.structure import Feedthrough
 from fmugym.systems.system_plan import Evaluation, Group, Link, Loop
 
-__all__ = ["Order", "order_of", "strong_components"]
+__all__ = ["SystemOrder", "order_of", "strong_components"]
 
 Node = TypeVar("Node", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Order:
+class SystemOrder:
     """The order of a system.
 
     Attributes:
@@ -47,7 +47,7 @@ def order_of(
     loop: Loop,
     unable: Container[str] = (),
     unable_at_start: Container[str] = (),
-) -> Order:
+) -> SystemOrder:
     """Order the components and links of a system.
 
     A component steps after those whose new values act on its outputs at once. Where nothing asks
@@ -57,10 +57,10 @@ def order_of(
         names: The components.
         links: The connections.
         told: The direct feed-through of each component.
-        loop: How algebraic loops are solved.
+        loop: Treatment of algebraic loops.
         unable: The components that cannot repeat a step. Their inputs in a loop count as given, so
             that only the rest of the loop is solved.
-        unable_at_start: Those for which the same holds at the start.
+        unable_at_start: Components for which the same holds at the start.
     """
     in_step = _chains(links, {name: one.in_step for name, one in told.items()})
     solvable, unsolved = _cut(in_step, links, unable)
@@ -72,7 +72,7 @@ def order_of(
     at_start = _chains(links, {name: one.at_start for name, one in told.items()})
     evaluable, unsolved_at_start = _cut(at_start, links, unable_at_start)
     evaluations = tuple(_evaluations(evaluable, loop))
-    return Order(groups, evaluations, loops, late, unsolved, unsolved_at_start)
+    return SystemOrder(groups, evaluations, loops, late, unsolved, unsolved_at_start)
 
 
 def _cut(
@@ -138,7 +138,7 @@ def _evaluations(graph: Mapping[int, Sequence[int]], loop: Loop) -> Iterator[Eva
 
 
 def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, tuple[str, ...]]:
-    """For each component, those that are in algebraic loops with it, and itself."""
+    """For each component, the components in algebraic loops with it, and itself."""
     team = {name: {name} for name in names}
     for loop in loops:
         union = set().union(*(team[end] for link in loop for end in (link.source, link.target)))
@@ -153,7 +153,7 @@ def _order_of_teams(
     links: Sequence[Link],
     told: Mapping[str, Feedthrough],
 ) -> tuple[list[tuple[str, ...]], tuple[Link, ...]]:
-    """Order the teams. Those that ask for each other's new values stay in the order of names."""
+    """Order the teams; teams in one cycle stay in the order of names."""
     acting = [
         link for link in links if _acts(link, told) and teams[link.source] != teams[link.target]
     ]

@@ -30,12 +30,12 @@ class FMUSystem(WiredSystem):
         units: Units of the system's own inputs, outputs and parameters by name; without one, they
             have the unit of the variable behind them.
         master: ``"gauss_seidel"``, where each component gets the newest values, or ``"jacobi"``.
-        loops: How algebraic loops are solved: ``"newton"``, or ``"refuse"``.
+        loops: Treatment of algebraic loops: ``"newton"``, or ``"refuse"``.
         loop_tolerance: Relative, and absolute below 1, for the values in a loop.
         loop_iterations: After so many, a step fails.
         step_size: The default communication step size in seconds; without one, the smallest
             default step size of the components.
-        start_time, stop_time: Of the default experiment, in seconds.
+        start_time, stop_time: Times of the default experiment, in seconds.
         tolerance: For the solvers of the components; None for their own defaults.
         description: For people.
         own_names: Names of the system itself that contain a dot.
@@ -47,7 +47,7 @@ class FMUSystem(WiredSystem):
         name, description, units, unit_definitions, own_names, master, loops: As given.
         components: The components by name, their FMUs read.
         connections: As given, as ``Connection`` objects.
-        loop: How algebraic loops are solved.
+        loop: Treatment of algebraic loops.
         times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
         links: The connections between components, with gains and offsets between the FMUs' units.
         connectors: The system's own inputs, outputs and parameters.
@@ -75,7 +75,7 @@ class FMUSystem(WiredSystem):
 
         Args:
             path: The ``.ssp`` file.
-            limits: What is too large to be opened.
+            limits: Limits of the size of an archive.
             master: One of those of ``FMUSystem``; by default what the archive says.
 
         Raises:
@@ -83,9 +83,9 @@ class FMUSystem(WiredSystem):
             FMULoadError: If the archive or an FMU cannot be read, or it has something that changes
                 results and is not supported, such as signal dictionaries.
         """
-        from fmugym.systems.ssp.archives import arguments_of  # optional: only archives need it
+        from fmugym.systems.ssp.archives import system_arguments  # optional: only archives need it
 
-        arguments = arguments_of(path, limits)
+        arguments = system_arguments(path, limits)
         if master is not None:
             arguments["master"] = master
         try:

@@ -1,4 +1,4 @@
-"""What a system says of itself, in the form in which an FMU says it."""
+"""Model description of a system, in the form of an FMU's."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _NO_PLAN: Final = SystemPlan("", ())
 
 @dataclass(frozen=True, eq=False)
 class PartVariable:
-    """A scalar or element of a component behind one of the system.
+    """Scalar or element of a component, which a variable of the system stands for.
 
     Attributes:
         part: The index of the component.
@@ -40,7 +40,7 @@ class PartVariable:
 
     @property
     def reading(self) -> tuple[float, float]:
-        """Gain and offset with which the value here gives that of the system's variable."""
+        """Gain and offset from the value here to the value of the system's variable."""
         if self.is_target and self.gain:
             return 1.0 / self.gain, -self.offset / self.gain
         return self.gain, self.offset
@@ -57,8 +57,8 @@ class SystemDescription(ModelDescription):
     Attributes:
         plan: The system.
         parts: The descriptions of the components.
-        ends: What stands behind each scalar and each element; one, except for connectors with
-            several ends.
+        ends: Variables of components behind each scalar and each element; one, except for
+            connectors with several ends.
     """
 
     plan: SystemPlan = _NO_PLAN
@@ -164,7 +164,7 @@ def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[st
 
 
 def _capabilities(parts: Sequence[ModelDescription]) -> Capabilities:
-    """What all components can; a restriction of one restricts the system."""
+    """Capabilities that all components have."""
     flags = [part.capabilities for part in parts]
     able = {
         field.name: all(getattr(one, field.name) for one in flags) for field in fields(Capabilities)
@@ -179,7 +179,7 @@ def _capabilities(parts: Sequence[ModelDescription]) -> Capabilities:
 
 
 def _units(plan: SystemPlan, parts: Iterable[ModelDescription]) -> dict[str, Unit]:
-    """All units; where two components disagree on a name, the first one wins."""
+    """All units; if two components differ on a name, the first one counts."""
     units: dict[str, Unit] = {}
     for part in parts:
         for name, unit in part.units.items():
@@ -228,7 +228,7 @@ def _sources(plan: SystemPlan) -> dict[tuple[str, str], str]:
 def _driven(
     plan: SystemPlan, parts: Sequence[ModelDescription], numbers: Mapping[str, int]
 ) -> dict[str, set[str]]:
-    """What links and connectors of the system set: it cannot be set by another name.
+    """Variables that links and connectors of the system set, so that other names may not set them.
 
     Returns:
         The names of scalars and elements by component.
@@ -279,13 +279,13 @@ def _start_text(variable: Variable, value: float | str | None) -> str | None:
 
 
 def _joined(array: Variable, texts: Iterable[str | None]) -> str:
-    """The start values of an array; those without a text of their own stay as they are."""
+    """Start values of an array; elements without a text of their own keep theirs."""
     pairs = zip(array.elements, texts, strict=True)
     return " ".join(repr(one.start_number) if text is None else text for one, text in pairs)
 
 
 def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -> Variable:
-    """What something else drives cannot be set from outside."""
+    """A variable under another name; a driven variable cannot be set from outside."""
     variable = replace(own, name=name, value_reference=reference)
     places = [place for place, one in enumerate(own.elements) if one.name in driven]
     if own.shape:

@@ -13,16 +13,16 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMULoadError
 from fmugym.systems.system_description import describe_system
-from fmugym.systems.system_plan import Component, SystemPlan
+from fmugym.systems.system_plan import ComponentPlan, SystemPlan
 
 __all__ = ["SystemFMU"]
 
 
 class SystemFMU(FMU):
-    """A system that can stand where an ``FMU`` can.
+    """A system with the interface of an ``FMU``.
 
     Args:
-        plan: What to execute.
+        plan: Execution plan.
         probe_timeout: See ``FMU``.
 
     Attributes:
@@ -66,7 +66,7 @@ class SystemFMU(FMU):
         return all(fmu.bundled for fmu in self._opened)
 
     def parts_in(self, folder: Path) -> list[tuple[FMU, Path]]:
-        """The FMUs of the components, and where each is in a folder like ``extract``'s."""
+        """FMUs of the components, with the place of each in a folder like ``extract``'s."""
         return [(fmu, folder / str(number)) for number, fmu in enumerate(self._opened)]
 
     @cached_property
@@ -76,7 +76,7 @@ class SystemFMU(FMU):
 
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
-        """What keeps the components from being loaded; see ``FMU.obstacles``."""
+        """Reasons why the components cannot be loaded; see ``FMU.obstacles``."""
         of_components = (
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()
@@ -112,7 +112,7 @@ class SystemFMU(FMU):
         found = [name for fmu in self._opened for name in fmu.missing_libraries]
         return tuple(dict.fromkeys(found))
 
-    def _pairs(self) -> Iterator[tuple[Component, FMU]]:
+    def _pairs(self) -> Iterator[tuple[ComponentPlan, FMU]]:
         return zip(self.plan.components, self._opened, strict=True)
 
     def _check_library(self) -> None:
@@ -132,9 +132,9 @@ class SystemFMU(FMU):
         return extracted
 
 
-def _opened(components: Iterable[Component]) -> Iterator[FMU]:
+def _opened(components: Iterable[ComponentPlan]) -> Iterator[FMU]:
     """The FMUs of components; a file is read once for all that use it in the same way."""
-    known: dict[Component, FMU] = {}
+    known: dict[ComponentPlan, FMU] = {}
     for component in components:
         use = replace(component, name="", steps=1, starts=())
         if use not in known:
@@ -142,7 +142,7 @@ def _opened(components: Iterable[Component]) -> Iterator[FMU]:
         yield known[use]
 
 
-def _open(component: Component) -> FMU:
+def _open(component: ComponentPlan) -> FMU:
     with _naming(component):
         return FMU(
             component.path,
@@ -154,7 +154,7 @@ def _open(component: Component) -> FMU:
 
 
 @contextmanager
-def _naming(component: Component) -> Iterator[None]:
+def _naming(component: ComponentPlan) -> Iterator[None]:
     """Name the component in errors."""
     try:
         yield

@@ -1,4 +1,4 @@
-"""What the master of a system executes, as data.
+"""Execution plan of a system's master, as data.
 
 A plan holds names and numbers only: it can be pickled, compared and hashed. Whoever makes one
 (Python, a task file, an SSP archive) has resolved units into gains and offsets, and has put the
@@ -28,7 +28,7 @@ from fmugym.archive.safe_zip import ArchiveLimits
 
 __all__ = [
     "MASTERS",
-    "Component",
+    "ComponentPlan",
     "Connector",
     "End",
     "Evaluation",
@@ -43,7 +43,7 @@ MASTERS: Final = ("gauss_seidel", "jacobi")
 
 
 @dataclass(frozen=True)
-class Component:
+class ComponentPlan:
     """One FMU of a system.
 
     Attributes:
@@ -109,7 +109,7 @@ class Group:
 
     Attributes:
         components: Their names.
-        loop: How the loop is solved; None if there is none. A group of several has one.
+        loop: Solution of the loop; None if there is none. A group of several has one.
     """
 
     components: tuple[str, ...]
@@ -122,7 +122,7 @@ class Evaluation:
 
     Attributes:
         links: Indices of the plan's links.
-        loop: How the loop of these links is solved; None if there is none.
+        loop: Solution of the loop of these links; None if there is none.
     """
 
     links: tuple[int, ...]
@@ -168,7 +168,7 @@ class SystemPlan:
     """A system, ready to be executed.
 
     Attributes:
-        name: Of the system, for messages.
+        name: Name of the system, for messages.
         components: The FMUs.
         links: The connections between them.
         groups: Every component in the order of the steps; each is in one group.
@@ -177,16 +177,16 @@ class SystemPlan:
         master: One of ``MASTERS``.
         connectors: The system's own names.
         step_size: The default communication step size in seconds; None for none.
-        start_time, stop_time: Of the default experiment, in seconds.
-        tolerance: Of the default experiment.
+        start_time, stop_time: Times of the default experiment, in seconds.
+        tolerance: Tolerance of the default experiment.
         description: For people.
-        findings: What is doubtful in the system, as texts.
-        file: Where the system was read from; None if it was made in Python.
+        findings: Doubtful facts about the system, as texts.
+        file: File of the system; None if it was made in Python.
         units: Definitions by name of units that the FMUs do not define.
     """
 
     name: str
-    components: tuple[Component, ...]
+    components: tuple[ComponentPlan, ...]
     links: tuple[Link, ...] = ()
     groups: tuple[Group, ...] = ()
     initialization: tuple[Evaluation, ...] = ()

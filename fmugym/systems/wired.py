@@ -1,4 +1,4 @@
-"""What follows from the components and connections of a system: its order and its plan."""
+"""Wired systems: components and connections, with the order and the plan that follow from them."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from fmugym.keys import (
     Key,
     Listed,
     Table,
-    checked,
+    checked_entry,
     option,
-    table_of,
+    table_of_fields,
 )
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
-from fmugym.systems.order import Order, order_of
+from fmugym.systems.order import SystemOrder, order_of
 from fmugym.systems.system_plan import MASTERS, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
-__all__ = ["LOOPS", "SYSTEM", "WiredSystem"]
+__all__ = ["SYSTEM", "WiredSystem"]
 
-LOOPS: Final = ("newton", "refuse")
-"""What is done about algebraic loops."""
+_LOOPS: Final = ("newton", "refuse")
+"""Treatments of algebraic loops."""
 
 
 SYSTEM: Final = Table(
     {
         "components": Key(
-            Entries(table_of(Component, make=Component, short="fmu")),
+            Entries(table_of_fields(Component, make=Component, short="fmu")),
             "By name: the path of an FMU, or a [component](systems.md#connect-fmus).",
             REQUIRED,
         ),
@@ -67,10 +67,10 @@ SYSTEM: Final = Table(
             MASTERS[0],
         ),
         "loops": Key(
-            option(*LOOPS),
+            option(*_LOOPS),
             "How [algebraic loops](systems.md#algebraic-loops) are solved, or that they are "
             "refused.",
-            LOOPS[0],
+            _LOOPS[0],
         ),
         "loop_tolerance": Key(
             POSITIVE,
@@ -100,7 +100,7 @@ class WiredSystem:
         name: str = "system",
         units: Mapping[str, str] | None = None,
         master: str = MASTERS[0],
-        loops: str = LOOPS[0],
+        loops: str = _LOOPS[0],
         loop_tolerance: float = Loop.tolerance,
         loop_iterations: int = Loop.max_iterations,
         step_size: float | None = None,
@@ -131,7 +131,7 @@ class WiredSystem:
             "stop_time": stop_time,
             "tolerance": tolerance,
         }
-        self._given = given = checked(SYSTEM, told)
+        self._given = given = checked_entry(SYSTEM, told)
         if not given["components"]:
             raise ConfigError("a system needs at least one component")
         self.name, self.description = given["name"], given["description"]
@@ -162,7 +162,7 @@ class WiredSystem:
         return f"{type(self).__name__}({self.name!r}: {', '.join(self.components)})"
 
     @cached_property
-    def order(self) -> Order:
+    def order(self) -> SystemOrder:
         """The order of steps and of the initialization, and the algebraic loops."""
         told = {name: one.feedthrough for name, one in self.components.items()}
         parts = {name: one.fmu.description for name, one in self.components.items()}
@@ -187,7 +187,7 @@ class WiredSystem:
 
     @cached_property
     def findings(self) -> tuple[str, ...]:
-        """What is doubtful in the system and in its FMUs, as texts."""
+        """Doubtful facts about the system and its FMUs, as texts."""
         untold = [
             f"{name} does not tell its direct feed-through; each output is taken to depend on all "
             "inputs"
@@ -203,7 +203,7 @@ class WiredSystem:
 
     @cached_property
     def plan(self) -> SystemPlan:
-        """What the master executes."""
+        """Execution plan of the master."""
         times = dict(self.times)
         if times["step_size"] is None:
             times["step_size"] = self._smallest_step()
@@ -239,7 +239,7 @@ _ARGUMENTS: Final = tuple(
 )
 
 
-def _findings_of(order: Order) -> Iterator[str]:
+def _findings_of(order: SystemOrder) -> Iterator[str]:
     for loop in order.loops:
         yield f"algebraic loop: {_told_loop(loop)}"
     for name in order.unsolved:
@@ -257,7 +257,7 @@ def _findings_of(order: Order) -> Iterator[str]:
 
 
 def _told_loop(loop: Sequence[Link]) -> str:
-    """The links of a loop one after the other, as far as each begins where another ends."""
+    """Links of a loop one after the other, as far as each begins at the end of another."""
     rest = list(loop)
     chain = [rest.pop(0)]
     while rest:

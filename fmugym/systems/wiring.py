@@ -1,4 +1,4 @@
-"""Connections resolved: which variables they join, by which gain and offset, and what is wrong."""
+"""Wiring: connections resolved to variables, gains and offsets, with their mistakes."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class Port:
 
     @property
     def kind(self) -> str:
-        """Of the variable, where items of enumerations count as integers."""
+        """Kind of the variable, with items of enumerations as integers."""
         kind = self.variable.kind
         return "integer" if kind == "enumeration" else kind
 
     @property
     def elements(self) -> Iterator[Port]:
-        """Its scalars: those of an array, or itself."""
+        """Scalars of an array, or the variable itself."""
         return (Port(self.component, element) for element in self.variable.elements)
 
     @property
@@ -65,7 +65,7 @@ class Wiring:
         definitions: Units of ``units``, and of FMUs that do not define them themselves.
 
     Attributes:
-        links: Those between components.
+        links: Links between components.
         connectors: The names of the system itself.
 
     Raises:
@@ -92,7 +92,7 @@ class Wiring:
         self.connectors = [self._connector(name, ends) for name, ends in self._ends.items()]
 
     def _connector(self, name: str, ends: list[End]) -> Connector:
-        """A name of the system, with a unit only where that is another than the variable's."""
+        """A name of the system; its unit is given only if it differs from the variable's."""
         unit, first = self.units.get(name), self._first(ends)
         if first is not None and unit == first.variable.unit:
             unit = None
@@ -147,12 +147,12 @@ class Wiring:
         return Link(*ends, end.gain, end.offset)
 
     def _unit(self, port: Port) -> _DefinedUnit:
-        """The unit of a variable; its FMU knows best what it means by a name."""
+        """Unit of a variable; its FMU's definition of the name counts."""
         units = port.component.fmu.description.units
         return port.variable.unit, {**self.definitions, **units}
 
     def _drive(self, target: Port, connection: Connection) -> None:
-        """Note what drives an input; there may be only one."""
+        """Note the source of an input, which may be only one."""
         variable = target.variable
         from_system = self.port(connection.source) is None
         if not (from_system and target.is_text):
@@ -191,7 +191,7 @@ class Wiring:
         return Port(component, component.variable(ends[0].variable))
 
     def _own_unit(self, name: str, port: Port) -> _DefinedUnit:
-        """The unit of a name of the system, by default that of a variable behind it."""
+        """Unit of a name of the system, by default of a variable behind it."""
         unit, known = self._unit(port)
         if name not in self.units:
             return unit, known
@@ -236,7 +236,7 @@ class Wiring:
                     yield from self._open_parts(Port(component, variable))
 
     def _open_parts(self, port: Port) -> Iterator[Port]:
-        """An input if nothing drives any of it; or else those of its elements that are open."""
+        """An input that nothing drives, or its elements that nothing drives."""
         if not self._has_driven(port):
             yield port
         elif port.variable.shape:
@@ -258,7 +258,7 @@ def _require_source(source: Port, connection: Connection) -> None:
 
 
 def _end(connection: Connection, port: Port, own: _DefinedUnit, other: _DefinedUnit) -> End:
-    """A variable, with what becomes of a value from one unit to the other and by the connection."""
+    """A variable, with the gain and offset of the units and of the connection."""
     conversion = IDENTITY
     if connection.convert_units:
         try:
@@ -273,7 +273,7 @@ def _end(connection: Connection, port: Port, own: _DefinedUnit, other: _DefinedU
 
 
 def _check_kinds(connection: Connection, source: Port, target: Port) -> None:
-    """Refuse what loses information: only integers may become reals."""
+    """Refuse a connection that loses information: only integers may become reals."""
     if not (source.is_text and target.is_text):
         _require_number(connection, source)
     shapes = source.variable.shape, target.variable.shape
@@ -306,7 +306,7 @@ def _shaped(port: Port) -> str:
 
 
 def _require_number(connection: Connection, port: Port) -> None:
-    """Refuse what a connection cannot carry.
+    """Refuse a variable that no connection can carry.
 
     Raises:
         ConfigError: If the variable is neither a number nor a Boolean, nor an array of them.

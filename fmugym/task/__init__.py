@@ -1,1 +1,1 @@
-"""What a task is made of: the FMU's interface, spaces, values by name, and episodes."""
+"""Parts of an environment: the FMU's interface, spaces, values by name, and episodes."""

@@ -1,4 +1,4 @@
-"""What hooks read: numbers for one environment, or arrays for N."""
+"""Quantities of an episode, which hooks read: numbers of one environment, or arrays of N."""
 
 from __future__ import annotations
 

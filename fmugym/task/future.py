@@ -1,4 +1,4 @@
-"""What hooks read that the state of an episode does not tell: data, and random numbers to come."""
+"""Future values that hooks read: data of later times, and random numbers to come."""
 
 from __future__ import annotations
 

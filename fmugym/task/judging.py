@@ -1,4 +1,4 @@
-"""What a step of the FMU means for a single environment: the result, the info and faults."""
+"""Result of a step of a single environment: reward, ends, info and faults."""
 
 from __future__ import annotations
 

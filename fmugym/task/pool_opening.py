@@ -1,4 +1,4 @@
-"""How an environment opens its FMU and makes its pool."""
+"""Opening of an environment's FMU and of its pool."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What makes the episode of a single environment, as columns of a snapshot."""
+"""Episode of a single environment as columns of a snapshot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fmugym.pool import Pool
 from fmugym.pool.extension import needs_engine
 from fmugym.task.construction import Constructed
 from fmugym.task.plain import changed, plain_attributes
-from fmugym.task.snapshot import Column, Columns, Scope
+from fmugym.task.snapshot import Columns, Scope, SnapshotColumn
 
 __all__ = [
     "READ",
@@ -93,7 +93,7 @@ def note_attributes(env: Constructed) -> None:
     env._as_constructed = plain_attributes(vars(env), env._own_names)
 
 
-def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
+def read_columns(env: Constructed, column: Callable[[Any], SnapshotColumn]) -> Columns:
     """Copy what hooks read, of one environment or of several.
 
     Args:

@@ -16,10 +16,10 @@ from fmugym.expressions.quantities import KEPT
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 
 __all__ = [
-    "Column",
     "Columns",
     "Scope",
     "Snapshot",
+    "SnapshotColumn",
     "checked_snapshot",
     "require_scope",
     "stacked",
@@ -34,7 +34,7 @@ _HASH: Final = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{8,}\b")
 _WIDE: Final = {"b": np.int64, "i": np.int64, "u": np.uint64, "f": np.float64}
 """By kind, the type in which numbers are compared."""
 
-Column = npt.NDArray[Any] | list[Any]
+SnapshotColumn = npt.NDArray[Any] | list[Any]
 """One value for each environment, which comes first."""
 
 Columns = dict[str, Any]

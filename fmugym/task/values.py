@@ -31,7 +31,7 @@ def array_places(names: Iterable[str]) -> dict[str, list[int]]:
     return places
 
 
-def stacked(values: Sequence[Any]) -> Any:
+def _stacked(values: Sequence[Any]) -> Any:
     """Make an array of the elements: numbers, or rows of numbers."""
     return np.array(values) if type(values[0]) is float else np.stack(values)
 
@@ -89,7 +89,7 @@ class NamedValues(Mapping[str, Any]):
         if places is None:
             raise unknown_name(self._kind, name, self._index) from None
         values = self._get_values()
-        return stacked([values[place] for place in places])
+        return _stacked([values[place] for place in places])
 
     def _spelt(self, name: Any) -> str | None:
         """The name of other letters that look the same; None if there is none."""
@@ -141,7 +141,7 @@ class ParameterValues(dict[str, Any]):
         if places is None:
             raise UnknownParameterError(str(unknown_name("parameter", name, self)))
         values = list(self.values())
-        return stacked([values[place] for place in places])
+        return _stacked([values[place] for place in places])
 
     def copy(self) -> ParameterValues:
         """A copy of the same kind."""

@@ -1,1 +1,1 @@
-"""Tools around an FMU: the command line, overviews, skeletons, linear models."""
+"""Command line: its commands, overviews, skeletons and checks."""

@@ -1,4 +1,4 @@
-"""How exact an FMU is with other settings: an episode, repeated with the same inputs.
+"""Accuracy of an FMU under other settings: an episode, repeated with the same inputs.
 
 The inputs of an episode are kept. The FMU alone repeats them, with other communication steps or
 solvers. What changes is an error of these settings.
@@ -25,10 +25,10 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.task.pool_opening import PoolOpening
 
-__all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
+__all__ = ["TOLERANCE", "OutputTrajectory", "Replay", "error_of", "substeps_of"]
 
 TOLERANCE: Final = 0.01
-"""The error up to which settings are exact enough, as a fraction of how much outputs vary."""
+"""Tolerated error of settings, as a part of the variation of outputs."""
 
 _CONVERGED: Final = 0.2 * TOLERANCE
 _STEPS: Final = 50
@@ -44,12 +44,12 @@ _NOTHING: Final = 1e-9
 
 
 _silent: Final = logging.Logger("fmugym.validate.settings", logging.CRITICAL + 1)
-"""Drops what the FMU says: it may fail with settings that are not those of the task."""
+"""Drops messages of the FMU, which may fail with settings other than the task's."""
 
 
 @dataclass(frozen=True)
-class Course:
-    """What an FMU gave.
+class OutputTrajectory:
+    """Outputs of an FMU in an episode.
 
     Attributes:
         outputs: Its real outputs at the start and after each step, shape (T + 1, k); NaN after a
@@ -69,7 +69,7 @@ class Replay:
 
     Attributes:
         opening: Makes the pool.
-        variables: Those that are set at the start.
+        variables: Variables that are set at the start.
         starts: Their values, shape (P, 1).
         inputs: The values of the inputs in each step, shape (T, m).
     """
@@ -81,7 +81,7 @@ class Replay:
 
     @classmethod
     def of(cls, env: FMUEnv) -> Replay:
-        """Play the beginning of an episode with random actions, and keep what the FMU got."""
+        """Play the beginning of an episode with random actions, and keep the FMU's inputs."""
         env.action_space.seed(0)
         env.reset(seed=0)
         draws, pool = env.episode_start, env.pool
@@ -105,7 +105,7 @@ class Replay:
         """The settings of the task."""
         return self.opening.spec
 
-    def run(self, **changes: Any) -> Course | None:
+    def run(self, **changes: Any) -> OutputTrajectory | None:
         """Repeat the episode with other settings.
 
         Args:
@@ -126,7 +126,7 @@ class Replay:
             pool.reset(self.variables, self.starts)
             return None if pool.statuses[0] > WARNING_CODE else self._played(pool)
 
-    def _played(self, pool: Pool) -> Course:
+    def _played(self, pool: Pool) -> OutputTrajectory:
         real = [i for i, one in enumerate(self.spec.outputs) if one.kind == "real"]
         rows = np.full((1 + len(self.inputs), len(real)), np.nan)
         rows[0] = pool.outputs[real, 0]
@@ -139,12 +139,14 @@ class Replay:
                 break
             row[:] = pool.outputs[real, 0]
             if sum(times) > _SECONDS:
-                return Course(rows[: 1 + len(times)], statistics.median(times), is_whole=False)
-        return Course(rows, statistics.median(times))
+                return OutputTrajectory(
+                    rows[: 1 + len(times)], statistics.median(times), is_whole=False
+                )
+        return OutputTrajectory(rows, statistics.median(times))
 
 
 def _untried(fmu: FMU) -> FMU:
-    """The FMU without trials: each setting would have one of its own.
+    """An FMU without trials, since each setting would have a trial of its own.
 
     So an FMU that is not bundled runs in a worker process, whose end is a failure of the setting.
     """
@@ -153,8 +155,10 @@ def _untried(fmu: FMU) -> FMU:
     return own
 
 
-def error_of(course: Course | None, reference: Course, steps: int | None = None) -> float:
-    """The difference of two courses, as a fraction of how much the outputs vary.
+def error_of(
+    course: OutputTrajectory | None, reference: OutputTrajectory, steps: int | None = None
+) -> float:
+    """Difference of two trajectories, as a part of the variation of the outputs.
 
     It is the root of the mean square over the steps, of the worst output. It is infinite for a
     course with a failure.
@@ -174,7 +178,7 @@ def error_of(course: Course | None, reference: Course, steps: int | None = None)
 
 
 def _variation(rows: FloatArray) -> FloatArray:
-    """How much each output varies, beyond its rounding."""
+    """Variation of each output, beyond its rounding."""
     varies: FloatArray = _root_mean_square(rows - rows[0])
     return np.where(varies > _NOTHING * np.abs(rows).max(axis=0), varies, 0.0)
 
@@ -187,11 +191,11 @@ def _root_mean_square(rows: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Substeps:
-    """What other numbers of substeps give.
+    """Results of other numbers of substeps.
 
     Attributes:
         needed: The least number that is exact enough; None if the results do not settle.
-        error: That of the task's own number of substeps.
+        error: Error of the task's own number of substeps.
         least: The difference of the two finest repetitions.
         finest: The largest number that was tried.
         seconds: The real time of a step by the number of substeps.
@@ -205,7 +209,7 @@ class Substeps:
 
 
 def substeps_of(replay: Replay) -> Substeps | None:
-    """Find out how many substeps are needed.
+    """Find the necessary number of substeps.
 
     The number is doubled until the results settle.
 
@@ -229,14 +233,14 @@ def substeps_of(replay: Replay) -> Substeps | None:
     return Substeps(needed, errors[own], least, finest, seconds)
 
 
-def _difference(courses: dict[int, Course | None], finest: int, steps: int) -> float:
-    """That of the finest repetition and the one before."""
+def _difference(courses: dict[int, OutputTrajectory | None], finest: int, steps: int) -> float:
+    """Difference of the finest repetition and the one before."""
     reference = courses[finest]
     before = max((n for n in courses if n < finest), default=finest)
     return np.inf if reference is None else error_of(courses[before], reference, steps)
 
 
-def _ladder(replay: Replay) -> Iterator[tuple[int, Course | None]]:
+def _ladder(replay: Replay) -> Iterator[tuple[int, OutputTrajectory | None]]:
     """Courses with 1, 2, 4 ... substeps, until they settle."""
     internal = replay.opening.fmu.description.fixed_internal_step_size or 0.0
     before, count = None, 1

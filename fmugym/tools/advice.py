@@ -1,4 +1,4 @@
-"""Settings that suit a task: what to write into its file, and why."""
+"""Recommended settings of a task, with reasons."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import FMUGymError
 from fmugym.linearization import linearize
 from fmugym.pool.spec import FIXED_STEP_SOLVERS
-from fmugym.tools.accuracy import TOLERANCE, Course, Replay, error_of, substeps_of
-from fmugym.tools.findings import Advice, Finding
+from fmugym.tools.accuracy import TOLERANCE, OutputTrajectory, Replay, error_of, substeps_of
+from fmugym.tools.findings import Advice, CheckResult
 from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
 
 __all__ = ["advise"]
 
-ComplexArray = npt.NDArray[np.complex128]
+_ComplexArray = npt.NDArray[np.complex128]
 
 _STEPS_OF_AN_OSCILLATION: Final = 10
 _STEPS_OF_A_TIME_CONSTANT: Final = 5
@@ -44,7 +44,7 @@ _EXACT: Final = 0.1 * TOLERANCE
 """The error that is recommended of solvers, whose tolerances cost little."""
 
 
-def advise(replay: Replay) -> Iterator[Advice | Finding]:
+def advise(replay: Replay) -> Iterator[Advice | CheckResult]:
     """Find settings of the time step, of substeps and of the solver.
 
     Args:
@@ -62,12 +62,12 @@ def advise(replay: Replay) -> Iterator[Advice | Finding]:
         yield from _of_substeps(replay)
 
 
-def _of_substeps(replay: Replay) -> Iterator[Advice | Finding]:
+def _of_substeps(replay: Replay) -> Iterator[Advice | CheckResult]:
     found, own = substeps_of(replay), replay.spec.substeps
     if found is None:
         return
     if found.needed is None:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "accuracy",
             f"with {found.finest} substeps the outputs still differ by {found.least:.2g} of their "
@@ -100,18 +100,18 @@ def _off(error: float) -> str:
 
 
 def _cost(seconds: float, before: float | None) -> str:
-    """What a change costs, in words; nothing if that is not known."""
+    """Describe the cost of a change; "" if it is not known."""
     return "" if before is None else f"; a step takes {seconds / before:.2g} times as long"
 
 
-def _of_solvers(replay: Replay) -> Iterator[Advice | Finding]:
+def _of_solvers(replay: Replay) -> Iterator[Advice | CheckResult]:
     """Compare the solvers of model exchange, each with some tolerances."""
     own = replay.run()
     finest = [replay.run(solver=name, tolerance=_FINEST, max_step=None) for name in _SOLVERS]
     known = [one for one in finest if one is not None and one.is_whole]
     least = error_of(known[0], known[1]) if len(known) == len(_SOLVERS) else 0.0
     if least > TOLERANCE:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "accuracy",
             f"the most exact solvers differ by {_share(least)} of the outputs' variation",
@@ -131,8 +131,10 @@ def _of_solvers(replay: Replay) -> Iterator[Advice | Finding]:
         yield from _solver(replay, best, _why(own, error, tried[best]))
 
 
-def _each_solver(replay: Replay, reference: Course) -> Iterator[tuple[tuple[str, float], Course]]:
-    """The settings that are exact enough, by solver and tolerance; those of the least cost."""
+def _each_solver(
+    replay: Replay, reference: OutputTrajectory
+) -> Iterator[tuple[tuple[str, float], OutputTrajectory]]:
+    """Exact settings of the least cost, by solver and tolerance."""
     for name in _SOLVERS:
         for tolerance in _TOLERANCES:
             course = replay.run(solver=name, tolerance=tolerance, max_step=None)
@@ -141,7 +143,7 @@ def _each_solver(replay: Replay, reference: Course) -> Iterator[tuple[tuple[str,
                 break
 
 
-def _why(own: Course | None, error: float, best: Course) -> str:
+def _why(own: OutputTrajectory | None, error: float, best: OutputTrajectory) -> str:
     if own is None or math.isinf(error):
         return "the solver of this task fails"
     cost = _cost(best.seconds, own.seconds)
@@ -157,7 +159,7 @@ def _solver(replay: Replay, best: tuple[str, float], why: str) -> Iterator[Advic
 
 
 def _time_step(replay: Replay) -> Advice | None:
-    """A time step that suits the eigenvalues of the FMU where it starts."""
+    """Recommend a time step from the eigenvalues at the start of the FMU."""
     eigenvalues = _eigenvalues(replay)
     if eigenvalues is None or not len(eigenvalues):
         return None
@@ -168,8 +170,8 @@ def _time_step(replay: Replay) -> Advice | None:
     return Advice("", "time_step", step, f"{what}, where the FMU starts")
 
 
-def _eigenvalues(replay: Replay) -> ComplexArray | None:
-    """Those of the linear model at the start; None if the FMU gives none."""
+def _eigenvalues(replay: Replay) -> _ComplexArray | None:
+    """Eigenvalues of the linear model at the start; None if the FMU gives none."""
     names = [variable.name for variable in replay.variables]
     starts = dict(zip(names, replay.starts[:, 0].tolist(), strict=True))
     verdict = known_verdict(replay.opening.fmu)
@@ -184,8 +186,8 @@ def _eigenvalues(replay: Replay) -> ComplexArray | None:
         own.close()
 
 
-def _longest(eigenvalues: ComplexArray) -> Iterator[tuple[float, str]]:
-    """Limits of the time step, and what gives them."""
+def _longest(eigenvalues: _ComplexArray) -> Iterator[tuple[float, str]]:
+    """Limits of the time step, and the reason for each."""
     rates, waves = np.abs(eigenvalues.real), np.abs(eigenvalues.imag)
     swings = waves[waves > rates]
     if len(swings):

@@ -1,4 +1,4 @@
-"""The command line: from a first look at an FMU to episodes of a task.
+"""Command line of fmugym: its parser, and the run of a command.
 
 ::
 
@@ -51,7 +51,7 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``in_wine``: whether its library is one for Windows, which runs in Wine here
 - ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
-  with ``name`` and a ``note``
+  with ``name`` and a ``print_note``
 - ``missing_tool``: the tool that must be installed as well; null if none is known to be missing
 - ``trial``: what the first meeting on this machine has shown: ``deterministic``, the
   ``noisy_outputs``, the grades of ``resets`` by method, the ``reset_method``, the
@@ -83,23 +83,23 @@ from typing import Any, Final, NoReturn
 import argcomplete
 
 from fmugym.errors import FMUGymError, unknown_name
-from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
 from fmugym.tools.fitting import add_fit
-from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_validate
 from fmugym.tools.learning import add_train
-from fmugym.tools.options import add_common, free_outputs, note, speaking
+from fmugym.tools.options import add_common, free_outputs, print_note, speaking
 from fmugym.tools.plants import add_serve
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
+from fmugym.tools.signal_handling import exit_code
 from fmugym.tools.standard_streams import (
     drop_output,
     escape_what_consoles_lack,
     keep_output_from_fmus,
     named,
 )
+from fmugym.tools.tune_command import add_tune
 
-__all__ = ["main"]
+__all__ = ["run_command_line"]
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_tune),
@@ -107,7 +107,7 @@ _COMMANDS: Final = (
 )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def run_command_line(argv: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
@@ -127,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _code_of(arguments)
         finally:
             if printed is not None and (file := named(printed)):
-                note(f"what FMUs and their libraries printed is in {file}; -v shows it")
+                print_note(f"what FMUs and their libraries printed is in {file}; -v shows it")
 
 
 def _code_of(arguments: argparse.Namespace) -> int:
@@ -143,7 +143,7 @@ def _code_of(arguments: argparse.Namespace) -> int:
         drop_output()
     except (FMUGymError, OSError) as error:
         for line in _told(error).splitlines():  # a task may have several mistakes
-            note(line, "error")
+            print_note(line, "error")
         return 1 if (end := _end_before(error)) is None else exit_code(end)
     return 0
 
@@ -157,7 +157,7 @@ def _end_before(error: BaseException) -> KeyboardInterrupt | None:
 
 
 def _told(error: Exception) -> str:
-    """An error as a text; those of the system without their numbers."""
+    """Describe an error; errors of the system come without their numbers."""
     if not isinstance(error, OSError):
         return str(error)
     if error.filename is None:
@@ -203,7 +203,7 @@ def _reader(kind: type[int] | type[float], what: str) -> Callable[[str], float]:
 
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
+    """Parse arguments; those of ``train`` may stand anywhere, which argparse does not know."""
     parser, commands = _parser()
     argcomplete.autocomplete(parser)
     given = sys.argv[1:] if argv is None else argv
@@ -221,7 +221,7 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _parser() -> tuple[_Parser, dict[str, _Parser]]:
-    """Make the parser; return it with those of the commands."""
+    """Make the parser; returns it with the parsers of the commands."""
     parser = _Parser("fmugym", description="Look at an FMU, make a task of it, and run that.")
     parser.add_argument("--version", action="version", version=version("fmugym-toolbox"))
     commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")

@@ -1,4 +1,4 @@
-"""Overview of the data of a task: how their files were read."""
+"""Overview of a task's data, as read from the files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fmugym.declared import Task
-from fmugym.declared.data_rows import Rows, read_rows, usual_distance
+from fmugym.declared.data_rows import DataRows, read_rows, usual_distance
 from fmugym.declared.dates import offset_text
 from fmugym.declared.entries import Entry
 from fmugym.declared.file_lists import files_of
@@ -63,7 +63,7 @@ def _series(entry: Entry, standard: int | None) -> dict[str, Any]:
         return {"file": entry.value["file"], "error": str(error)}
 
 
-def _file(rows: Rows) -> dict[str, Any]:
+def _file(rows: DataRows) -> dict[str, Any]:
     """The facts that series of one file share."""
     table, time, places = rows.table, rows.time, np.flatnonzero(~np.isnan(rows.times))
     dates = None if time is None or time.is_numeric else time.dates_in(_zone(rows))
@@ -82,11 +82,11 @@ def _file(rows: Rows) -> dict[str, Any]:
     }
 
 
-def _zone(rows: Rows) -> Any:
+def _zone(rows: DataRows) -> Any:
     return rows.entry.value.get("timezone")
 
 
-def _values(rows: Rows) -> dict[str, Any]:
+def _values(rows: DataRows) -> dict[str, Any]:
     times = rows.times[rows.is_known]
     return {
         "decimal_commas": rows.value.has_commas,
@@ -100,7 +100,7 @@ def data_as_text(facts: Mapping[str, Any]) -> Iterator[str]:
     """Format an overview of data for a terminal: each file once, with its columns below.
 
     Args:
-        facts: What ``overview_of_data`` returned.
+        facts: Result of ``overview_of_data``.
     """
     if not facts["series"] and facts["error"] is None:
         return

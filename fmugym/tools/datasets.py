@@ -1,4 +1,4 @@
-"""Datasets of Minari, which ``simulate`` makes and ``info`` reads."""
+"""Datasets of Minari, made by ``simulate`` and read by ``info``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, Final
 from fmugym.declared import Task, load
 from fmugym.declared.standard_time import standard_time
 from fmugym.env import FMUEnv
-from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.progress_bars import progress_bar
 from fmugym.episodes.simulation import Player, simulate
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
@@ -112,7 +112,7 @@ def make_dataset(arguments: argparse.Namespace) -> None:
 
 
 def show_dataset(arguments: argparse.Namespace, name: str) -> None:
-    """Say what is in a dataset, and write its recordings to a folder if one is given."""
+    """Describe a dataset, and write its recordings to a folder if one is given."""
     recordings = imported("fmugym.minari", "minari").read_dataset(name)
     what, folder = f"dataset {name}", arguments.output
     if folder is not None:
@@ -126,7 +126,7 @@ def show_dataset(arguments: argparse.Namespace, name: str) -> None:
 def _logged(
     arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]
 ) -> tuple[list[Recording], Callable[..., FMUEnv]]:
-    """The episodes of logs, and what makes an environment of their time."""
+    """Read the episodes of logs, and make an environment for their time."""
     columns = dict(map(renaming, arguments.column or []))
     tolerance = 1e-3 if arguments.tolerance is None else arguments.tolerance
     found, make = list[Recording](), make_env
@@ -158,7 +158,7 @@ def renaming(text: str) -> tuple[str, str]:
 def _played(
     arguments: argparse.Namespace, make_env: Callable[[], FMUEnv], player: Player
 ) -> list[Recording]:
-    with closing(make_env()) as env, progress(None, "dataset") as advance:
+    with closing(make_env()) as env, progress_bar(None, "dataset") as advance:
         recorder, policy = Recorder(env), player.make_policy(env)
         found: list[Recording] = []
         for seed in range(arguments.seed, arguments.seed + arguments.episodes):

@@ -1,4 +1,4 @@
-"""The command that exports agents: export."""
+"""Command ``export``: agents as C, FMUs and ONNX."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from fmugym.baselines.table_texts import acting_text
 from fmugym.episodes.output_files import require_picture
 from fmugym.episodes.simulation import given_controller
 from fmugym.errors import ConfigError, shown
-from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
+from fmugym.export import ExportedAgent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
 from fmugym.export.exportable import check_name
-from fmugym.export.fmus import FMI_VERSIONS
+from fmugym.export.fmus import EXPORT_VERSIONS
 from fmugym.export.names import new_file
 from fmugym.export.surrogates import agent_of_surrogate
 from fmugym.files import replaced
 from fmugym.search.excitation import fitted_surrogate
-from fmugym.search.policy import Agent as FoundAgent
+from fmugym.search.policy import ResidualAgent
 from fmugym.search.residual import Residual
 from fmugym.surrogate.prediction import plot_prediction, predicted
 from fmugym.tools.options import (
@@ -30,7 +30,7 @@ from fmugym.tools.options import (
     Commands,
     add_command,
     add_json,
-    check_numbers,
+    check_counts,
     say_result,
     tell,
 )
@@ -41,7 +41,7 @@ __all__ = ["add_export"]
 
 _ENDINGS: Final = (".c", ".fmu", ".onnx")
 _STEPS: Final = 2000
-"""Those of an FMU to which a surrogate is fitted."""
+"""Steps of an FMU to which a surrogate is fitted."""
 
 _UNSEEN: Final = 4
 """Episodes in which the picture of a surrogate compares it with the FMU."""
@@ -101,7 +101,7 @@ def add_export(commands: Commands) -> None:
         help="data of the task that the agent is given, instead of having them in tables",
     )
     command.add_argument(
-        "--fmi", choices=FMI_VERSIONS, default="2.0", help="version of an FMU; default 2.0"
+        "--fmi", choices=EXPORT_VERSIONS, default="2.0", help="version of an FMU; default 2.0"
     )
     command.add_argument(
         "--platform",
@@ -134,25 +134,25 @@ def _export(arguments: argparse.Namespace) -> None:
     model, normalization = None, None
     if arguments.agent is not None:
         model, normalization = read_agent(arguments.agent, arguments.algorithm)
-    is_physical = model is None or isinstance(model, FoundAgent | Residual)
+    is_physical = model is None or isinstance(model, ResidualAgent | Residual)
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:
         options = {"all_inputs": arguments.all_inputs, "external": arguments.external}
         if model is None:
             text = acting_text(given_controller(env, arguments.controller))
             controller_of(text)  # raises for ranges
-            model = FoundAgent("controller", text)
+            model = ResidualAgent("controller", text)
         agent = agent_of(env, model, normalization, name=output.stem, **options)
     _show(agent, _written(agent, output, arguments), arguments)
 
 
-def _surrogate(arguments: argparse.Namespace) -> Agent:
+def _surrogate(arguments: argparse.Namespace) -> ExportedAgent:
     """Fit a surrogate to simulations of the FMU of a task."""
     if arguments.output.suffix != ".fmu":
         name = shown(arguments.output.name)
         raise ConfigError(f"a surrogate is an FMU: expected a file that ends in .fmu, got {name}")
     if arguments.agent is None:
         raise ConfigError("--surrogate needs a task: fmugym export task.toml --surrogate ...")
-    check_numbers(arguments, "steps")
+    check_counts(arguments, "steps")
     make_env = partial(maker_of(str(arguments.agent)), physical=True)
     check_name(arguments.output.stem)
     with closing(make_env()) as env:
@@ -170,7 +170,7 @@ def _surrogate(arguments: argparse.Namespace) -> Agent:
     return agent_of_surrogate(found, arguments.output.stem, units)
 
 
-def _written(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[Path]:
+def _written(agent: ExportedAgent, output: Path, arguments: argparse.Namespace) -> list[Path]:
     """Write an agent in the format that the file's ending tells."""
     if output.suffix == ".c":
         return write_c(agent, output.parent)
@@ -183,7 +183,7 @@ def _written(agent: Agent, output: Path, arguments: argparse.Namespace) -> list[
     return [write_fmu(agent, output, fmi_version=arguments.fmi, platforms=platforms)]
 
 
-def _show(agent: Agent, files: list[Path], arguments: argparse.Namespace) -> None:
+def _show(agent: ExportedAgent, files: list[Path], arguments: argparse.Namespace) -> None:
     logic = agent.logic
     parts = {
         "measurements": [_facts(one) for one in logic.measurements],

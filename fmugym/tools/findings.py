@@ -1,4 +1,4 @@
-"""What ``validate`` reports: findings, costs and recommended settings."""
+"""Results of ``validate``: checks, costs and recommended settings."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any
 
 from fmugym.errors import plain
 
-__all__ = ["Advice", "Finding", "Report", "lines_of"]
+__all__ = ["Advice", "CheckResult", "ValidationReport", "lines_of"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """The result of a check.
 
     Attributes:
         verdict: ``"ok"``, ``"warning"`` or ``"error"``.
-        check: What was checked.
-        text: What was found.
-        cure: What to do about it; empty if there is nothing to do.
+        check: Name of the check.
+        text: Description of the result.
+        cure: Advice; empty for none.
     """
 
     verdict: str
@@ -36,8 +36,8 @@ class Advice:
 
     Attributes:
         table: The table it stands in; ``""`` for the top of the file.
-        key, value: What it says.
-        why: What was measured.
+        key, value: Recommended setting.
+        why: Measurement behind the advice.
     """
 
     table: str
@@ -52,21 +52,21 @@ class Advice:
 
 
 @dataclass(frozen=True)
-class Report:
+class ValidationReport:
     """The results of all checks.
 
     Attributes:
         findings: The results in the order of the checks.
         costs: Seconds of real time by name: ``step``, ``reset`` and ``restore`` of one environment.
             None for a restore that the FMU does not allow.
-        hooks: How a vector environment calls the hooks: ``expressions``, ``arrays`` or
+        hooks: Calls of hooks in a vector environment: ``expressions``, ``arrays`` or
             ``one by one``.
-        reset_method: How episodes begin.
+        reset_method: Method by which episodes begin.
         recommended: Settings that suit the task, by name.
         advices: Lines for the task file, of these settings.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckResult, ...]
     costs: Mapping[str, float | None]
     hooks: str
     reset_method: str

@@ -1,4 +1,4 @@
-"""The command that finds parameters of an FMU in logs of a plant: fit."""
+"""Command ``fit``: parameters of an FMU from logs of a plant."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Final
 from fmugym.checks import duration
 from fmugym.episodes.evaluation import aligned
 from fmugym.episodes.output_files import require_picture
-from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.progress_bars import progress_bar
 from fmugym.errors import ConfigError, shown
 from fmugym.files import replaced
 from fmugym.fit import fit_logs, write_rows
@@ -23,8 +23,8 @@ from fmugym.tools.options import (
     add_command,
     add_json,
     add_task,
-    check_numbers,
-    note,
+    check_counts,
+    print_note,
     require_toml,
     say_result,
     write_extension,
@@ -92,7 +92,7 @@ def add_fit(commands: Commands) -> None:
 
 
 def _fit(arguments: argparse.Namespace) -> None:
-    check_numbers(arguments, "candidates")
+    check_counts(arguments, "candidates")
     make_env, output = maker_of(arguments.task, None, arguments.master), arguments.output
     if output is not None:
         require_toml(output)
@@ -101,7 +101,7 @@ def _fit(arguments: argparse.Namespace) -> None:
     if not arguments.parameter:
         raise ConfigError(f"name what to fit with --parameter: {_possible(make_env)}")
     wash_in = arguments.wash_in
-    with progress(None, "fit", "simulations") as advance:
+    with progress_bar(None, "fit", "simulations") as advance:
         fit = fit_logs(
             make_env,
             [read_log(path, arguments) for path in arguments.log],
@@ -154,7 +154,7 @@ def _show(fit: FitResult, arguments: argparse.Namespace) -> None:
     facts = _facts(fit) | {"shift": None if shift is None else shift._asdict()}
     say_result(arguments, facts, "\n".join(_table(fit)))
     for one in ([] if shift is None else [_told(shift)]) + _warnings(fit, shift is not None):
-        note(one)
+        print_note(one)
 
 
 def _told(shift: Shift) -> str:
@@ -211,7 +211,7 @@ def _table(fit: FitResult) -> list[str]:
 
 
 def _warnings(fit: FitResult, has_shift: bool) -> list[str]:
-    """What a reader of the table must know."""
+    """Warnings for a reader of the table."""
     found = []
     for name, one in fit.correlations.items():
         if not one.is_noise and not has_shift:

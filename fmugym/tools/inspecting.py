@@ -1,4 +1,4 @@
-"""The commands for an FMU or a task itself: info, new, validate."""
+"""Commands ``info``, ``new`` and ``validate``, about an FMU or a task itself."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _SECONDS: Final = 10.0
 _SCHEMA_NAME: Final = "fmugym.schema.json"
 _NO_DATA: Final = {"series": (), "error": None}
 _SCHEMA_LINE: Final = f"#:schema ./{_SCHEMA_NAME}\n"
-"""It tells editors what keys mean. A file beside the task works offline and elsewhere, too."""
+"""Line with the schema of the keys for editors; a file beside the task works offline, too."""
 
 
 def add_info(commands: Commands) -> None:

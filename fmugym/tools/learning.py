@@ -1,4 +1,4 @@
-"""The command that trains: train."""
+"""Command ``train``."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ from fmugym.tools.options import (
     add_command,
     add_json,
     add_task,
-    check_numbers,
+    check_counts,
     say_result,
     tell,
 )
 from fmugym.tools.targets import maker_of, scenarios_of
 from fmugym.tools.watching import watched
-from fmugym.training.agents import FACTS
+from fmugym.training.agents import AGENT_FILE
 from fmugym.training.checkpoints import CHECKPOINT
-from fmugym.training.diary import Diary
 from fmugym.training.environments import fitting_envs
-from fmugym.training.hyperparameters import tune
+from fmugym.training.hyperparameters import tune_hyperparameters
 from fmugym.training.outcome import write_curve, write_outcome
 from fmugym.training.residuals import residual_facts
 from fmugym.training.searching import STATE, Searching
@@ -41,10 +40,11 @@ from fmugym.training.training import (
     TRAINING,
     TrainingSettings,
     Watch,
-    arguments_of,
+    algorithm_arguments,
     facts_of,
     train,
 )
+from fmugym.training.training_records import TrainingRecords
 
 __all__ = ["add_train"]
 
@@ -56,7 +56,7 @@ _DEFAULTS: Final[dict[str, Any]] = {
     "episodes": 5,
     "normalize": True,
 }
-"""What holds if neither the options nor a training that is resumed say otherwise."""
+"""Defaults of options that neither the user nor a resumed training gives."""
 
 
 def add_train(commands: Commands) -> None:
@@ -142,7 +142,7 @@ _OF_ALGORITHMS: Final = (
 )
 _OF_SEARCHES: Final = ("minutes", "rounds")
 _SCALE: Final = 0.3
-"""Of the range of actions: what a residual policy adds at most."""
+"""Largest correction by a residual policy, as a part of the range of actions."""
 _OTHERWISE: Final = {"arguments": "KEY=VALUE", "normalize": "--no-normalize"}
 _COUNTS: Final = ("rounds", "steps", "envs", "episodes")
 
@@ -173,7 +173,7 @@ def _refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> No
 def _search(arguments: argparse.Namespace) -> None:
     given = {name: getattr(arguments, name) for name in _COUNTS}
     counts = {name: value for name, value in given.items() if value is not None}
-    check_numbers(arguments, *counts)
+    check_counts(arguments, *counts)
     if arguments.minutes is not None:
         check_number("--minutes", arguments.minutes, positive=True)
     task, master = arguments.task, arguments.master
@@ -210,7 +210,7 @@ def _search(arguments: argparse.Namespace) -> None:
 
 
 def _tell_faults(parts: Mapping[str, float]) -> None:
-    """Tell what may have decided beside the rewards."""
+    """Report faults, which may have decided beside the rewards."""
     if any(parts.values()):
         listing = ", ".join(f"{name} {100 * part:.3g} %" for name, part in parts.items())
         tell(f"episodes that a fault has cut short, which count before the reward: {listing}")
@@ -237,7 +237,7 @@ def _learn(arguments: argparse.Namespace) -> None:
 
 def _tell_what_is_kept(folder: Path, state: str) -> None:
     """After Ctrl-C."""
-    if not (folder / FACTS).exists():
+    if not (folder / AGENT_FILE).exists():
         tell("nothing was trained yet")
     elif (folder / state).exists():
         tell(f"{folder} has the best agent until now; --resume goes on with the training")
@@ -246,7 +246,7 @@ def _tell_what_is_kept(folder: Path, state: str) -> None:
 
 
 def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
-    """The settings that the options make, together with what a training was begun with."""
+    """Settings of a training, from the options and from the training that is resumed."""
     before = facts_of(arguments.output) if arguments.resume else {}
     for name, default in _DEFAULTS.items():
         if getattr(arguments, name) is None:
@@ -255,8 +255,8 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
     make_env = maker_of(arguments.task, master=master)
     if arguments.envs is None:
         arguments.envs = fitting_envs(make_env)
-    check_numbers(arguments, "steps", "envs", "episodes")
-    own = arguments_of(arguments.arguments) or before.get("arguments", {})
+    check_counts(arguments, "steps", "envs", "episodes")
+    own = algorithm_arguments(arguments.arguments) or before.get("arguments", {})
     held_out = {name: maker_of(arguments.task, name, master) for name in names}
     return TrainingSettings(
         make_env,
@@ -270,14 +270,14 @@ def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
         normalize=arguments.normalize,
         arguments=own,
         residual=_residual_of(arguments, make_env, before.get("residual")),
-        diary=_diary_of(arguments, before.get("record")),
+        records=_records_of(arguments, before.get("record")),
     )
 
 
 def _residual_of(
     arguments: argparse.Namespace, make_env: Callable[..., FMUEnv], before: Any
 ) -> Any:
-    """What the options say of a controller; without any, what the training was begun with."""
+    """Residual policy of the options, or else of the training that is resumed."""
     if arguments.residual is None:
         if arguments.residual_scale is not None:
             raise ConfigError("name the controller, too: --residual NAME")
@@ -286,35 +286,35 @@ def _residual_of(
     return residual_facts(make_env, arguments.residual, scale, tell)
 
 
-def _diary_of(arguments: argparse.Namespace, before: Any) -> Diary | None:
-    """What the options say to record; without any, what the training was begun with."""
+def _records_of(arguments: argparse.Namespace, before: Any) -> TrainingRecords | None:
+    """Records of the options, or else of the training that is resumed."""
     own = (arguments.record_env, arguments.record_every, arguments.record_format)
     if arguments.record is None:
         if any(one is not None for one in own):
             raise ConfigError("name the variables to record, too: --record '*'")
-        return Diary.of(before)
+        return TrainingRecords.of(before)
     environments = tuple(arguments.record_env or (0,))
-    return Diary(tuple(arguments.record), environments, own[1], own[2] or "csv")
+    return TrainingRecords(tuple(arguments.record), environments, own[1], own[2] or "csv")
 
 
 def _tuned(settings: TrainingSettings, arguments: argparse.Namespace) -> TrainingSettings:
     if arguments.resume:
         raise ConfigError("--tune is for a new training, which --resume is not")
     arguments.tune_steps = arguments.tune_steps or max(1, settings.steps // 10)
-    check_numbers(arguments, "tune", "tune_steps")
+    check_counts(arguments, "tune", "tune_steps")
     with watched(arguments.tune, "tune", "trials") as advance:
 
         def noted(line: str) -> None:
             advance(1)
             tell(line)
 
-        best = tune(settings, arguments.tune, arguments.tune_steps, noted)
+        best = tune_hyperparameters(settings, arguments.tune, arguments.tune_steps, noted)
     tell(f"the best arguments are {json.dumps(best)}")
     return replace(settings, arguments=best)
 
 
 def _show(settings: TrainingSettings, scores: list[Score], arguments: argparse.Namespace) -> None:
-    best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
+    best = json.loads((settings.folder / AGENT_FILE).read_text(encoding="utf-8"))
     told = {"best": best, "scores": [one.as_dict() for one in scores]}
     facts = {"steps": settings.steps, **settings.facts(), **told}
     say_result(arguments, facts, table(scores))

@@ -1,4 +1,4 @@
-"""What commands of the command line share: arguments, who acts, and output."""
+"""Options that commands share, players among them, and the output of results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fmugym.episodes.progress_bars import quiet
 from fmugym.episodes.simulation import Player, action_of, policy_of
 from fmugym.errors import ConfigError, plain, shown
 from fmugym.systems.system_plan import MASTERS
-from fmugym.training.agents import FACTS, agent_player
+from fmugym.training.agents import AGENT_FILE, agent_player
 
 __all__ = [
     "HELP_OF_TASK",
@@ -35,12 +35,12 @@ __all__ = [
     "add_master",
     "add_players",
     "add_task",
-    "check_numbers",
+    "check_counts",
     "free_outputs",
-    "note",
     "only_player",
     "output_of",
     "players_of",
+    "print_note",
     "require_toml",
     "say",
     "say_json",
@@ -60,13 +60,13 @@ _CONTROLLER: Final = "a controller and its arguments: 'pid of=T setpoint=21 kp=0
 _ACTION: Final = "random, or the numbers of one action: 0.5,-1"
 _OF_ONE_KIND: Final = 3
 MINARI: Final = "minari:"
-"""What the name of a dataset of Minari begins with, where files or FMUs may be named, too."""
+"""Beginning of the name of a Minari dataset, where files or FMUs may be named, too."""
 
 _FILES: Final = ("output", "plot")
 """Options that name files or folders to write."""
 
 _OF_TRAININGS: Final = ("agent.json", "evaluations.csv", "search.npz", "training.json")
-"""Files by which a folder is known to be that of a training, so that ``--force`` replaces it."""
+"""Files that mark the folder of a training, which ``--force`` replaces."""
 
 EXAMPLES: Final = {
     "info": (
@@ -107,10 +107,10 @@ EXAMPLES: Final = {
     "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 10",),
     "bench": ("fmugym bench task.toml --seconds 0.1",),
 }
-"""What ``--help`` shows of each command; a test finds these lines in the documents."""
+"""Examples in ``--help`` of each command; a test finds these lines in the documents."""
 
-SCHEMA: Final = 1
-"""Of the JSON; raised when a key goes or changes its meaning. New keys do not raise it."""
+_JSON_VERSION: Final = 1
+"""Version of the JSON; raised when a key goes or changes its meaning."""
 
 
 def add_command(
@@ -132,7 +132,7 @@ def add_command(
 
 
 def add_common(command: argparse.ArgumentParser) -> None:
-    """Add the options of all commands, and ``--force`` where one writes files."""
+    """Add the options of all commands, and ``--force`` for a command that writes files."""
     group = command.add_mutually_exclusive_group()
     group.add_argument("-q", "--quiet", action="store_true", help="print results and errors only")
     group.add_argument(
@@ -156,7 +156,7 @@ def add_task(command: argparse.ArgumentParser, also: str = "") -> None:
 
 
 def add_master(command: argparse.ArgumentParser) -> None:
-    """Add the option for how systems run."""
+    """Add the option for the master of systems."""
     text = "how a system exchanges values, in the place of what its SSP archive or task says"
     command.add_argument("--master", choices=MASTERS, help=text)
 
@@ -187,7 +187,7 @@ def add_episodes(command: argparse.ArgumentParser, episodes: int, seed: int) -> 
 
 
 def add_players(command: argparse.ArgumentParser) -> None:
-    """Add the options for who acts, each of which may be given several times."""
+    """Add the options for players, each of which may be given several times."""
     command.add_argument("--action", action="append", default=[], metavar="TEXT", help=_ACTION)
     command.add_argument(
         "--controller", action="append", default=[], metavar="TEXT", help=_CONTROLLER
@@ -203,10 +203,10 @@ def add_players(command: argparse.ArgumentParser) -> None:
 
 
 def players_of(arguments: argparse.Namespace, *, random: bool = False) -> dict[str, Player]:
-    """Make those who act, by name, of the options of ``add_players``.
+    """Make players by name, from the options of ``add_players``.
 
     Args:
-        arguments: Those of the command line.
+        arguments: Arguments of the command line.
         random: Whether random actions are among them in any case. They are if nobody else is.
 
     Raises:
@@ -225,7 +225,7 @@ def players_of(arguments: argparse.Namespace, *, random: bool = False) -> dict[s
 
 
 def only_player(arguments: argparse.Namespace) -> Player:
-    """The one who acts, where there can be only one.
+    """Return the player where only one is allowed.
 
     Raises:
         ConfigError: If there are several, or as ``players_of``.
@@ -241,7 +241,7 @@ def output_of(text: str) -> Path | str:
     return text if text.startswith(MINARI) else Path(text)
 
 
-def check_numbers(arguments: argparse.Namespace, *names: str) -> None:
+def check_counts(arguments: argparse.Namespace, *names: str) -> None:
     """Refuse counts below 1 and seeds that are none.
 
     Raises:
@@ -257,13 +257,13 @@ def say(text: str) -> None:
     print(text)
 
 
-def note(text: str, kind: str = "note") -> None:
+def print_note(text: str, kind: str = "note") -> None:
     """Print a line to the error stream."""
     tell(f"fmugym: {kind}: {text}", is_needed=kind == "error")
 
 
 def tell(text: str, *, is_needed: bool = False) -> None:
-    """Print a line of progress to the error stream; ``--quiet`` leaves out what is not needed."""
+    """Print a line of progress to the error stream, unless ``--quiet`` leaves it out."""
     if is_needed or not quiet.get():
         print(plain(text), file=sys.stderr)
 
@@ -295,7 +295,7 @@ def speaking(arguments: argparse.Namespace) -> Iterator[None]:
     finally:
         left_out = sum(max(0, count - _OF_ONE_KIND) for count in kinds.values())
         if left_out:
-            note(f"{left_out} more warnings of these kinds; -v shows them")
+            print_note(f"{left_out} more warnings of these kinds; -v shows them")
         quiet.reset(token)
         logger.removeHandler(handler)
         logger.setLevel(level)
@@ -333,8 +333,8 @@ def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
 
 
 def _is_complete(path: Path, has_failed: bool) -> bool:
-    """Whether there is a new file; what is in the folder of a training is complete at any time."""
-    return (path / FACTS).exists() if path.is_dir() else path.exists() and not has_failed
+    """Whether there is a new file; files in the folder of a training are complete at any time."""
+    return (path / AGENT_FILE).exists() if path.is_dir() else path.exists() and not has_failed
 
 
 def _remove(path: Path) -> None:
@@ -371,11 +371,11 @@ def _outputs_of(arguments: argparse.Namespace) -> Iterator[Path]:
 
 def say_json(facts: dict[str, Any]) -> None:
     """Print one JSON object."""
-    say(json.dumps({"schema": SCHEMA, **facts}, indent=2, default=str))
+    say(json.dumps({"schema": _JSON_VERSION, **facts}, indent=2, default=str))
 
 
 def say_result(arguments: argparse.Namespace, facts: Mapping[str, Any], text: str) -> None:
-    """Print what a command has found: with ``--json`` as one JSON object, otherwise as a text."""
+    """Print the result of a command: with ``--json`` as a JSON object, otherwise as a text."""
     if not arguments.json:
         say(text)
         return
@@ -385,7 +385,7 @@ def say_result(arguments: argparse.Namespace, facts: Mapping[str, Any], text: st
 
 @contextmanager
 def shown_in_any_case(show: Callable[[], None]) -> Iterator[None]:
-    """Show what was found, also after Ctrl-C."""
+    """Show the result of a block, also after Ctrl-C."""
     try:
         yield
     except KeyboardInterrupt:
@@ -427,4 +427,4 @@ def write_text(text: str, output: Path | None, notes: Iterable[str]) -> None:
     else:
         write_new(output, text)
     for one in notes:
-        note(one)
+        print_note(one)

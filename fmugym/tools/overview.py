@@ -1,4 +1,4 @@
-"""The facts about an FMU that a user asks for first, as plain data and as text.
+"""Overview of an FMU: its main facts, as plain data and as text.
 
 They come from the archive and the XML. Nothing of the FMU is executed.
 """
@@ -16,12 +16,12 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.episodes.evaluation import aligned
 from fmugym.errors import FMULoadError, first_of, plain
-from fmugym.series.choice import matches
+from fmugym.series.recorded_quantities import matches
 from fmugym.trial.known import known_verdict
 
-__all__ = ["as_text", "finite_or_none", "headed", "overview", "start_value", "tables"]
+__all__ = ["as_text", "finite_or_none", "headed", "overview", "tables", "typed_start"]
 
-SHOWN: Final = ("input", "output", "parameter")
+_SHOWN: Final = ("input", "output", "parameter")
 """The causalities that are listed by default."""
 
 _HEADINGS: Final = {
@@ -43,7 +43,7 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
 
     Args:
         fmu: The FMU.
-        everything: List variables of all causalities, not only those in ``SHOWN``.
+        everything: List variables of all causalities, not only those in ``_SHOWN``.
         pattern: List the variables of all causalities whose name matches. ``*`` matches any text
             and ``?`` one character; brackets match themselves, since names of arrays have them.
 
@@ -78,7 +78,7 @@ def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) 
 
 
 def _trial(fmu: FMU) -> dict[str, Any] | None:
-    """What the first meeting has shown on this machine; None if there was none yet."""
+    """Results of the trial on this machine; None if there was none yet."""
     verdict = known_verdict(fmu)
     if verdict is None:
         return None
@@ -121,7 +121,7 @@ _TIMES: Final = ("start_time", "stop_time", "step_size", "tolerance")
 
 def _is_wanted(variable: Variable, everything: bool, pattern: str | None) -> bool:
     if pattern is None:
-        return everything or variable.causality in SHOWN
+        return everything or variable.causality in _SHOWN
     return matches(pattern, variable.name)
 
 
@@ -131,18 +131,18 @@ def _row(variable: Variable) -> dict[str, Any]:
         "shape": list(variable.shape),
         "min": finite_or_none(variable.minimum),
         "max": finite_or_none(variable.maximum),
-        "start": start_value(variable),
+        "start": typed_start(variable),
         "items": [{"name": name, "value": value} for name, value in variable.items],
     }
 
 
 def finite_or_none(number: float) -> float | None:
-    """JSON has no infinities."""
+    """Return a finite number; None for infinity and NaN, which JSON lacks."""
     return number if math.isfinite(number) else None
 
 
-def start_value(variable: Variable) -> bool | int | float | str | None:
-    """Convert the start value, which the XML has as text, to the variable's type.
+def typed_start(variable: Variable) -> bool | int | float | str | None:
+    """Convert a start value from its text in the XML to the type of the variable.
 
     Returns:
         The value; the text itself for strings, arrays and what is not finite or malformed.
@@ -163,7 +163,7 @@ def as_text(facts: Mapping[str, Any]) -> str:
     """Format an overview for a terminal.
 
     Args:
-        facts: What ``overview`` returned.
+        facts: Result of ``overview``.
 
     Returns:
         Lines of printable ASCII.
@@ -173,16 +173,16 @@ def as_text(facts: Mapping[str, Any]) -> str:
 
 
 def tables(facts: Mapping[str, Any]) -> Iterator[str]:
-    """The part of an overview below the heading: the trial, findings, variables, those not listed.
+    """Body of an overview: the trial, findings, variables, and the number of the others.
 
     Args:
-        facts: What ``overview`` returned.
+        facts: Result of ``overview``.
     """
     yield from (*_trial_lines(facts), *_findings(facts), *_tables(facts), *_not_listed(facts))
 
 
 def headed(facts: Mapping[str, Any], kind: str, rows: Mapping[str, str]) -> Iterator[str]:
-    """The heading of an overview: what it is about, and some facts by name."""
+    """Heading of an overview: its subject, and some facts by name."""
     yield plain(f"{facts['model_name']} ({kind})")
     if facts["description"]:
         yield plain(facts["description"])

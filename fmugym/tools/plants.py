@@ -1,4 +1,4 @@
-"""The commands about plants: serve, and simulate --plant."""
+"""Commands about plants: ``serve``, and ``simulate --plant``."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from typing import Any, Final
 from fmugym.checks import check_count, check_number, duration
 from fmugym.declared import Task
 from fmugym.declared.writing import as_toml
-from fmugym.episodes.output_files import Recording
-from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.output_files import EpisodeFiles
+from fmugym.episodes.progress_bars import progress_bar
 from fmugym.episodes.simulation import Summary, simulate
 from fmugym.errors import ConfigError, plain, shown
 from fmugym.plant import Server, connect
+from fmugym.plant.loopback_plant import with_plant
 from fmugym.plant.predicting import Error
-from fmugym.plant.proposing import with_plant
 from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
     Commands,
     add_command,
     add_json,
     add_players,
-    check_numbers,
+    check_counts,
     only_player,
     say,
     say_result,
     shown_in_any_case,
 )
 
-__all__ = ["add_of_plants", "add_serve", "follow_plant", "task_of"]
+__all__ = ["add_of_plants", "add_serve", "follow_plant", "plant_task"]
 
 _AHEAD: Final = "3h"
 
@@ -57,7 +57,7 @@ def _clock(arguments: argparse.Namespace) -> RealClock:
     return RealClock(check_number("--speed", arguments.speed, positive=True))
 
 
-def task_of(arguments: argparse.Namespace) -> Task:
+def plant_task(arguments: argparse.Namespace) -> Task:
     """Read the task of a plant.
 
     Raises:
@@ -69,15 +69,19 @@ def task_of(arguments: argparse.Namespace) -> Task:
 
 
 def follow_plant(arguments: argparse.Namespace) -> None:
-    """Let one who acts be the shadow of a plant, until so many steps are done."""
+    """Let a player be the shadow of a plant for so many steps."""
     if arguments.scenario is not None or arguments.episodes != 1:
         raise ConfigError("a plant has no --scenario and no --episodes: say --steps")
     player = only_player(arguments)
     ahead = duration("--ahead", arguments.ahead)
     make_env: Any = partial(
-        connect, task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
+        connect,
+        plant_task(arguments),
+        arguments.plant or None,
+        ahead=ahead,
+        clock=_clock(arguments),
     )
-    recording, done = Recording(arguments.task, None, arguments.output), list[Summary]()
+    recording, done = EpisodeFiles(arguments.task, None, arguments.output), list[Summary]()
     with closing(player.make_env(make_env)) as env:
         shadow: Any = env
         played = shadow
@@ -87,7 +91,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
         with (
             shown_in_any_case(lambda: _show(arguments, done, shadow.errors())),
             recording.finished(arguments.seed),
-            progress(arguments.steps, "shadow") as advance,
+            progress_bar(arguments.steps, "shadow") as advance,
         ):
             while (left := arguments.steps - sum(one.steps for one in done)) > 0:
                 done.append(simulate(played, policy, arguments.seed, left, advance))
@@ -103,7 +107,7 @@ def _show(arguments: argparse.Namespace, done: Sequence[Summary], errors: Sequen
 
 
 def _table(errors: Sequence[Error]) -> list[str]:
-    """The errors of predictions, by variable, at each doubling of how far they go."""
+    """Errors of predictions by variable, at horizons that double."""
     lines = []
     for name in dict.fromkeys(one.name for one in errors):
         own = [one for one in errors if one.name == name]
@@ -134,10 +138,10 @@ def add_serve(commands: Commands) -> None:
 
 
 def _serve(arguments: argparse.Namespace) -> None:
-    check_numbers(arguments)
+    check_counts(arguments)
     steps = arguments.steps if arguments.steps is None else check_count("--steps", arguments.steps)
     options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
-    task, player = task_of(arguments), only_player(arguments)
+    task, player = plant_task(arguments), only_player(arguments)
     has_plant = "plant" in task.document
     if arguments.protocol is not None:
         task = with_plant(task, arguments.protocol)

@@ -1,4 +1,4 @@
-"""The commands that play episodes: simulate, evaluate, bench."""
+"""Commands that play episodes: ``simulate``, ``evaluate``, ``bench``."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fmugym.baselines.arena import most_steps_of
+from fmugym.baselines.candidate_evaluation import most_steps_of
 from fmugym.checks import Spellings
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
-from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
+from fmugym.episodes.output_files import EpisodeFiles, require_format, require_picture, title_of
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import ConfigError, plain, reason
 from fmugym.tools.datasets import (
@@ -30,7 +30,7 @@ from fmugym.tools.options import (
     add_json,
     add_players,
     add_task,
-    check_numbers,
+    check_counts,
     output_of,
     players_of,
     say,
@@ -39,9 +39,9 @@ from fmugym.tools.options import (
     shown_in_any_case,
     tell,
 )
-from fmugym.tools.plants import add_of_plants, follow_plant, task_of
+from fmugym.tools.plants import add_of_plants, follow_plant, plant_task
 from fmugym.tools.shadows import evaluate_log
-from fmugym.tools.speed import Report, bench, speed_table
+from fmugym.tools.speed import SpeedReport, bench, speed_table
 from fmugym.tools.targets import maker_of, player_maker, scenarios_of
 from fmugym.tools.watching import watched
 
@@ -75,7 +75,7 @@ def add_simulate(commands: Commands) -> None:
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
-    check_numbers(arguments, "episodes", "steps")
+    check_counts(arguments, "episodes", "steps")
     if dataset_of(arguments) is not None:
         make_dataset(arguments)
         return 0
@@ -87,7 +87,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     players = players_of(arguments)
     for path in arguments.output:
         require_format(path, len(players))
-    recording = Recording(arguments.task, arguments.scenario, arguments.output)
+    recording = EpisodeFiles(arguments.task, arguments.scenario, arguments.output)
     runs: dict[str, list[Summary]] = {name: [] for name in players}
 
     def show() -> None:
@@ -117,12 +117,12 @@ def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
 
 def _play(
     arguments: argparse.Namespace,
-    recording: Recording,
+    recording: EpisodeFiles,
     name: str,
     player: Player,
     runs: dict[str, list[Summary]],
 ) -> None:
-    """Play the episodes of one who acts."""
+    """Play the episodes of a player."""
     label = f"{name}: " if len(runs) > 1 else ""
     with (
         closing(player.make_env(_maker(arguments))) as env,
@@ -139,7 +139,7 @@ def _play(
 
 
 def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
-    """How many steps the episodes take at most; None if only ``--steps`` limits them."""
+    """Most steps of the episodes; None if only ``--steps`` limits them."""
     limit = most_steps_of(env)
     return None if limit is None else min(limit, arguments.steps) * int(arguments.episodes)
 
@@ -170,7 +170,7 @@ def add_evaluate(commands: Commands) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    check_numbers(arguments, "episodes", "steps")
+    check_counts(arguments, "episodes", "steps")
     if arguments.plot is not None:
         require_picture(arguments.plot)
     if arguments.log is not None and arguments.scenario:
@@ -187,7 +187,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         if arguments.log is not None:
-            task, log = task_of(arguments), read_log(arguments.log, arguments)
+            task, log = plant_task(arguments), read_log(arguments.log, arguments)
             with watched(1.0, "evaluate") as advance:
                 scores.extend(evaluate_log(task, log, players, advance, leave_out))
         else:
@@ -206,7 +206,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
 
 class LeftOut:
-    """Those who cannot play to the end, and are left out. The others play all the same.
+    """Players that failed and are left out, while the others play on.
 
     Args:
         players: All who shall play, by name.
@@ -227,7 +227,7 @@ class LeftOut:
 
     @contextmanager
     def noting(self, name: str) -> Iterator[None]:
-        """Leave one out who fails in a block."""
+        """Leave out a player if a block fails."""
         try:
             yield
         except Exception as error:
@@ -235,11 +235,11 @@ class LeftOut:
 
     @property
     def _asked(self) -> list[str]:
-        """Those who were asked for; random actions always play."""
+        """Players that the user asked for; random actions always play."""
         return [name for name in self._names if name != "random"] or self._names
 
     def require_some(self) -> None:
-        """Raise the first error if none is left of those who were asked for."""
+        """Raise the first error if no player is left that the user asked for."""
         if all(name in self.errors for name in self._asked):
             raise self.errors[self._asked[0]]
 
@@ -286,7 +286,7 @@ def add_bench(commands: Commands) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    reports: list[Report] = []
+    reports: list[SpeedReport] = []
 
     def show() -> None:
         for last in reports[-1:]:  # which has the speeds of those before

@@ -1,4 +1,4 @@
-"""A first version of a task file for an FMU, written from its model description.
+"""Proposal of a task file for an FMU, made from its model description.
 
 The names and texts come from a foreign file. They enter the TOML only as quoted texts, as numbers
 and in comments of one line.
@@ -21,7 +21,7 @@ from fmugym.declared.declarations import is_reserved
 from fmugym.declared.likely_units import likely_units
 from fmugym.errors import ConfigError, plain
 from fmugym.systems.system_description import SystemDescription
-from fmugym.tools.overview import start_value
+from fmugym.tools.overview import typed_start
 from fmugym.tools.skeleton import (
     END_OF_EXPERIMENT,
     Skeleton,
@@ -58,14 +58,14 @@ _DEGREES: Final = 5.0
 """A set point of a temperature is this near to its start; zero of its unit means nothing."""
 
 _ROOM: Final = {"K": 293.15, "degC": 20.0, "degF": 68.0}
-"""What a temperature without a start is controlled to."""
+"""Set points of a temperature without a start value, by unit."""
 
 _GOAL: Final = re.compile(
     r"level|height|position|angle|speed|veloc|omega|rpm|pressure"
     r"|(^|\.)[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
     re.IGNORECASE,
 )
-"""What is often controlled, in names, descriptions and units."""
+"""Pattern of variables that are often controlled, in names, descriptions and units."""
 
 _OUTSIDE: Final = re.compile(
     r"\b(t ?(out|amb|ext)|amb|ambient|out(door|side)s?|weather|sol|solar|sun|irradi\w+|wind"
@@ -76,7 +76,7 @@ _OUTSIDE: Final = re.compile(
 
 
 class Proposal:
-    """The task file for one FMU, with notes on what in it is a guess.
+    """Proposed task file for an FMU, with notes on its guesses.
 
     Args:
         fmu: The FMU; nothing of it is executed.
@@ -118,7 +118,7 @@ class Proposal:
         return {one.name for one in description.plan.connectors}
 
     def _why_none(self) -> str:
-        """What a user can do where nothing can be acted on."""
+        """Advice for an FMU without an input to act on."""
         fixed = [v.name for v in self._skeleton.parameters if v.numeric]
         if not isinstance(self._fmu.description, SystemDescription):
             return ""
@@ -153,7 +153,7 @@ class Proposal:
         return aliases
 
     def notes(self) -> Iterator[str]:
-        """What the user has to decide before the task is useful."""
+        """Decisions for the user, before the task is useful."""
         yield f"reward and set point are guesses: {self._goal.name!r} follows {self._setpoint!r}"
         for variable in self._others:
             yield f"input {variable.name!r} looks like a disturbance: no action writes it"
@@ -221,7 +221,7 @@ class Proposal:
                 yield f"{self._aliases[variable.name]} = {_table(parts)}{self._remark(variable)}"
 
     def _parts(self, variable: Variable, alias: str) -> list[str]:
-        """What the task has to say of any variable: its name in the FMU, and its unit there."""
+        """Keys of any variable: its name in the FMU, and its unit there."""
         unit = self._guessed.get(_scalar_or_array(variable))
         name = [f"name = {_quoted(variable.name)}"] if alias != variable.name else []
         return name if unit is None else [*name, f"fmu_unit = {_quoted(unit)}"]
@@ -346,7 +346,7 @@ def _is_outside(variable: Variable) -> bool:
 
 
 def _unlikeliness(variable: Variable) -> tuple[bool, ...]:
-    """What speaks against an output as what is to be controlled, the strongest doubt first."""
+    """Reasons against an output as the controlled variable, the strongest first."""
     return (
         variable.kind != "real",
         variable.unit not in _TEMPERATURES,
@@ -357,7 +357,7 @@ def _unlikeliness(variable: Variable) -> tuple[bool, ...]:
 
 def _ends_of_setpoint(variable: Variable) -> tuple[float, float]:
     """Values near the start of a temperature, or in the middle of the range of another output."""
-    start = start_value(variable) or variable.nominal or _ROOM.get(variable.unit or "")
+    start = typed_start(variable) or variable.nominal or _ROOM.get(variable.unit or "")
     if variable.unit in _TEMPERATURES and isinstance(start, int | float):
         return start - _DEGREES, start + _DEGREES
     low, high = guessed_bounds(variable)
@@ -380,7 +380,7 @@ def _key(name: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """A basic string of TOML, ASCII; its escapes are those of JSON."""
+    """Quote a text as a basic string of TOML, in ASCII; its escapes are those of JSON."""
     parts = re.split(r"([\ud800-\udfff\U00010000-\U0010ffff\x7f])", text)
     escaped = "".join(
         f"\\U{ord(part):08x}" if index % 2 else json.dumps(part)[1:-1]

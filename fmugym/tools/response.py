@@ -1,4 +1,4 @@
-"""How outputs follow inputs, and whether episodes are long enough for them."""
+"""Response times of outputs, compared with the length of episodes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["advise_episodes"]
 
 _STEPS: Final = 200
 _STEPS_OF_AN_EPISODE: Final = 25
-"""So many steps of the first response are an episode; those of the next ones are longer."""
+"""Number of steps of an episode in the first response; later ones are longer."""
 
 _FACTORS: Final = tuple(8**power for power in range(7))
 _MOST_SUBSTEPS: Final = 64
@@ -39,11 +39,11 @@ _MANY: Final = 2000
 """Steps of an episode for which longer ones are recommended."""
 
 _LONG: Final = 800
-"""At least so many steps those then take, as actions may follow what is faster."""
+"""Least number of steps of those, as actions may follow faster responses."""
 
 
 def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice]:
-    """Recommend longer episodes where outputs are slow.
+    """Recommend longer episodes for slow outputs.
 
     Args:
         replay: An episode.
@@ -64,7 +64,7 @@ def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice]:
 
 
 def _time_constants(replay: Replay, steps: int) -> dict[Variable, float]:
-    """How long real outputs take to follow constant inputs, in s; 0 if they never change.
+    """Time constants of real outputs under constant inputs, in s; 0 without a change.
 
     The time at which one comes near the value where it rests counts: what swings has it soon.
     Outputs that do not settle, such as positions and levels, have none.

@@ -1,4 +1,4 @@
-"""What ``evaluate --log`` makes of the record of a shadow: the plant, and others in its place."""
+"""Evaluation of a shadow's log (``evaluate --log``): the plant, compared with other players."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def evaluate_log(
     advance: Advance,
     leave_out: Callable[[str, Exception], None] | None = None,
 ) -> Iterator[Score]:
-    """Compare what a plant has reached with what others reach on the FMU in the same periods.
+    """Compare the plant's results with other players on the FMU in the same periods.
 
     Args:
         task: The task.
         log: The record of a shadow, whose times are seconds of the year.
-        players: Who acts on the FMU.
+        players: Players on the FMU.
         advance: Is told of each step on the FMU, as a part of all.
         leave_out: See ``evaluate``.
 
@@ -92,7 +92,7 @@ def evaluate_log(
 
 
 def _replayed(recordings: Sequence[Recording]) -> Player:
-    """One who does what was done, episode by episode."""
+    """Player that repeats logged actions, episode by episode."""
     left: Iterator[np.ndarray[Any, Any]] = iter(())
     each = iter(recordings)
 

@@ -1,4 +1,4 @@
-"""A first version of an environment for an FMU, written from its model description.
+"""Skeleton of an environment class for an FMU, made from its model description.
 
 The names and texts come from a foreign file. They enter the program only as literals and in
 comments of one line, so that none of them can become code.
@@ -23,7 +23,7 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMULoadError, plain
 from fmugym.repair.stand_in import replaceable
 from fmugym.systems.system_description import SystemDescription
-from fmugym.tools.overview import start_value
+from fmugym.tools.overview import typed_start
 
 __all__ = [
     "END_OF_EXPERIMENT",
@@ -36,22 +36,22 @@ __all__ = [
     "rounded_down",
 ]
 
-MOST_PARAMETERS: Final = 40
+_MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
 
-DEFAULT_STEP: Final = 0.01
-"""The step size in seconds where the FMU tells nothing about its time."""
+_DEFAULT_STEP: Final = 0.01
+"""Step size in seconds for an FMU without a default experiment."""
 
-MOST_ELEMENTS: Final = 100
+_MOST_ELEMENTS: Final = 100
 """Larger arrays are left out."""
 
-MOST_LOCALS: Final = 8
-"""Locals that replace outputs where the FMU has none."""
+_MOST_LOCALS: Final = 8
+"""Most locals that stand for the outputs of an FMU without any."""
 
-STEPS: Final = 500
-"""About as many steps has the default experiment where the FMU gives no usable step size."""
+_EPISODE_STEPS: Final = 500
+"""Approximate number of steps in a default experiment without a usable step size."""
 
-MOST_STEPS: Final = 100_000
+_MOST_STEPS: Final = 100_000
 """More steps than this are no episode."""
 
 _SOLVER: Final = re.compile(
@@ -127,7 +127,7 @@ _HOOKS_WITHOUT_INPUT: Final = '''
 
 
 class Skeleton:
-    """The Python file for one FMU, with notes on what in it is a guess.
+    """Python file for an FMU, with notes on its guesses.
 
     Args:
         fmu: The FMU; nothing of it is executed.
@@ -153,20 +153,20 @@ class Skeleton:
     @cached_property
     def outputs(self) -> list[Variable]:
         """The numeric outputs, or some locals if there are none."""
-        return _scalars(self._of("output")) or _scalars(self._of("local"))[:MOST_LOCALS]
+        return _scalars(self._of("output")) or _scalars(self._of("local"))[:_MOST_LOCALS]
 
     @cached_property
     def parameters(self) -> list[Variable]:
         """The parameters of the model that can be set and have a start value.
 
-        At most ``MOST_PARAMETERS``. Those of the exporter's solver are left out.
+        At most ``_MOST_PARAMETERS``. Those of the exporter's solver are left out.
         """
         usable = (v for v in self._of("parameter") if v.settable_at_start and literal(v))
-        return [v for v in usable if not _SOLVER.search(v.name)][:MOST_PARAMETERS]
+        return [v for v in usable if not _SOLVER.search(v.name)][:_MOST_PARAMETERS]
 
     @property
     def left_out(self) -> int:
-        """How many parameters of the FMU are not among ``parameters``."""
+        """Number of parameters of the FMU that are not among ``parameters``."""
         return len(self._of("parameter")) - len(self.parameters)
 
     def _of(self, causality: str) -> list[Variable]:
@@ -187,7 +187,7 @@ class Skeleton:
         return ("Model" if not name or name[0].isdigit() else "") + name + "Env"
 
     def notes(self) -> Iterator[str]:
-        """What the user has to decide before the file is useful."""
+        """Decisions for the user, before the file is useful."""
         for variable in filter(needs_bounds, self.inputs):
             yield f"the FMU gives no limits of input {variable.name!r}; set them in 'bounds'"
         if not self.inputs:
@@ -276,12 +276,12 @@ class Skeleton:
 
     @property
     def episode_steps(self) -> int:
-        """As many steps as the default experiment has, unless that is no episode."""
+        """Number of steps in the default experiment, unless that is no episode."""
         return round(self._duration / self.time_step) if self.has_duration else 200
 
     @property
     def stop_time(self) -> float | None:
-        """Where the FMU's default experiment ends; None where it gives no end, or one too early.
+        """End of the FMU's default experiment; None for none, or one too early.
 
         Some FMUs do not start without one.
         """
@@ -299,7 +299,7 @@ class Skeleton:
     @property
     def has_duration(self) -> bool:
         """Whether an episode takes as long as the FMU's default experiment."""
-        return 1 <= self._duration / self.time_step <= MOST_STEPS
+        return 1 <= self._duration / self.time_step <= _MOST_STEPS
 
     @property
     def has_step_size(self) -> bool:
@@ -312,10 +312,10 @@ class Skeleton:
         """A round number of seconds, or a multiple of the FMU's internal step size."""
         internal = self._description.fixed_internal_step_size
         if not 0.0 < self._duration < math.inf:
-            return internal or DEFAULT_STEP
+            return internal or _DEFAULT_STEP
         if internal:
-            return internal * max(1, round(self._duration / STEPS / internal))
-        return rounded_down(self._duration / STEPS)
+            return internal * max(1, round(self._duration / _EPISODE_STEPS / internal))
+        return rounded_down(self._duration / _EPISODE_STEPS)
 
 
 def old_libraries(fmu: FMU) -> tuple[str, ...]:
@@ -361,12 +361,12 @@ def guessed_bounds(variable: Variable) -> tuple[float, float]:
 
 
 def _start(variable: Variable) -> float:
-    value = start_value(variable)
+    value = typed_start(variable)
     return float(value) if isinstance(value, int | float) else 0.0
 
 
 def _reach(variable: Variable) -> tuple[float, float]:
-    """How far below and above its start value an input without limits may move.
+    """Distances below and above its start value that an input without limits may move.
 
     A tenth of a start value, and at most the nominal value. Without both, nothing is known; a model
     then fails more often with negative values than with positive ones.
@@ -389,7 +389,7 @@ def rounded_down(value: float) -> float:
 
 def _scalars(variables: Sequence[Variable]) -> list[Variable]:
     """The numeric scalars, and the elements of numeric arrays that are not large."""
-    usable = (v for v in variables if v.is_number and v.size <= MOST_ELEMENTS)
+    usable = (v for v in variables if v.is_number and v.size <= _MOST_ELEMENTS)
     # something else drives elements of another causality
     return [one for v in usable for one in v.elements if one.causality == v.causality]
 
@@ -404,7 +404,7 @@ def given_start(variable: Variable) -> Any:
     """The start value as the config takes it; None if the config takes none."""
     if variable.shape and variable.is_number and variable.start is not None:
         return _array_start(variable)
-    value = start_value(variable)
+    value = typed_start(variable)
     if variable.kind == "string" and not variable.shape:
         return value
     if not variable.numeric or isinstance(value, str):
@@ -416,13 +416,13 @@ def given_start(variable: Variable) -> Any:
 def _array_start(variable: Variable) -> Any:
     """Nested lists of the start values; None if they are many, or are malformed."""
     with suppress(ConfigError):
-        if 0 < variable.size <= MOST_ELEMENTS:
+        if 0 < variable.size <= _MOST_ELEMENTS:
             return np.reshape(variable.start_numbers, variable.shape).tolist()
     return None
 
 
 def _quoted(text: str) -> str:
-    """A literal in ASCII, in double quotes where they need no escape."""
+    """Quote a text as a literal in ASCII, in double quotes if they need no escape."""
     literal = ascii(text)
     return literal if '"' in literal else f'"{literal[1:-1]}"'
 

@@ -1,4 +1,4 @@
-"""How fast a task is: steps per second of one environment and of many, and the FMU's share."""
+"""Speed of a task: steps per second of one environment and of many, and the FMU's share."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["Report", "Speed", "bench", "speed_table"]
+__all__ = ["Speed", "SpeedReport", "bench", "speed_table"]
 
 _ROUNDS: Final = 5
-"""A measurement is the fastest of so many: what else the machine does only makes it slower."""
+"""Number of measurements, the fastest of which counts: other load only makes them slower."""
 
 _CAUTION: Final = (
     "Measured on this machine as it is now. Close other programs, measure several times, and "
@@ -35,8 +35,8 @@ class Speed:
 
     Attributes:
         envs: How many; 0 stands for a single environment without vectors.
-        hooks: How hooks are called.
-        steps_per_second: Of all environments together, resets included.
+        hooks: Calls of the hooks.
+        steps_per_second: Steps per second of all environments together, resets included.
         microseconds: Real time of one call of ``step``.
         fmu_share: The part of it that the FMUs take by themselves; None if it cannot be measured.
     """
@@ -49,11 +49,11 @@ class Speed:
 
 
 @dataclass(frozen=True)
-class Report:
+class SpeedReport:
     """The result of a measurement.
 
     Attributes:
-        speeds: Of a single environment, and of vector environments.
+        speeds: Speeds of a single environment, and of vector environments.
         time_step: The simulated seconds in a step.
         processors: How many this process may use.
         load: The mean number of running programs in the last minute; None if it is not known.
@@ -65,7 +65,9 @@ class Report:
     load: float | None
 
 
-def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) -> Iterator[Report]:
+def bench(
+    make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float
+) -> Iterator[SpeedReport]:
     """Measure the speed of a task with random actions.
 
     Args:
@@ -85,7 +87,7 @@ def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) 
     load: float | None = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with closing(make_env()) as env:
         time_step = env.pool_spec.time_step
-        report = Report((_of_single(env, seconds),), time_step, _processors(), load)
+        report = SpeedReport((_of_single(env, seconds),), time_step, _processors(), load)
     yield report
     for size in sizes:
         report = replace(report, speeds=(*report.speeds, _of_vector(make_env, size, seconds)))
@@ -136,7 +138,7 @@ def _fastest(step: Callable[[int], Any], seconds: float) -> float:
 
 
 def _count(step: Callable[[int], Any], seconds: float) -> int:
-    """About how many calls take so long."""
+    """Estimated number of calls in a time."""
     count = 1
     while True:
         begin = perf_counter()
@@ -172,7 +174,7 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     return min(1.0, best / took)
 
 
-def speed_table(report: Report) -> str:
+def speed_table(report: SpeedReport) -> str:
     """Format speeds for a terminal."""
     header = ("environments", "hooks", "steps/s", "us per call", "FMU's share", "x real time")
     rows = [header, *(_row(speed, report.time_step) for speed in report.speeds)]

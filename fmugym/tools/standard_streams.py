@@ -1,4 +1,4 @@
-"""The standard streams of the command line, which FMUs and their libraries must not write to."""
+"""Standard streams of the command line, which FMUs and their libraries must not write to."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus", 
 
 
 def keep_output_from_fmus(*, shown: bool) -> BinaryIO | None:
-    """Let the standard streams have what Python prints; all else goes elsewhere.
+    """Keep the standard streams for Python's output; all other output goes elsewhere.
 
     FMUs print what they like. A table, or the JSON that another program reads, must not have it
     between its lines. The C library writes what it still has when the process ends, so this is not
@@ -56,7 +56,7 @@ def _apart(stream: Any) -> Any:
 
 
 def named(printed: BinaryIO) -> Path | None:
-    """Give what FMUs have printed a file with a name; None if they have printed nothing."""
+    """Give a name to the file with the output of FMUs; None if there is no output."""
     with suppress(OSError, AttributeError, TypeError):  # Windows has no such library
         ctypes.CDLL(None).fflush(None)
     if not printed.seek(0, os.SEEK_END):
@@ -75,5 +75,5 @@ def escape_what_consoles_lack() -> None:
 
 
 def drop_output() -> None:
-    """Discard what is still buffered, which the interpreter would complain about at its end."""
+    """Discard buffered output, about which the interpreter would complain at its end."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

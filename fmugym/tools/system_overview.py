@@ -1,4 +1,4 @@
-"""The facts about a system that a user asks for first, as plain data and as text."""
+"""Overview of a system: its main facts, as plain data and as text."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ __all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"
 
 
 def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
-    """Find what a file is or names: an FMU, an SSP archive, or a task file with one of both.
+    """Find the model of a path: an FMU, an SSP archive, or a task file with one of both.
 
     Args:
         path: The file.
-        master: Of a system, in the place of what the file says.
+        master: Master algorithm of a system, in the place of the one in the file.
 
     Raises:
         ConfigError: If the task file or the system has a mistake.
@@ -108,7 +108,7 @@ def as_text_of_system(facts: Mapping[str, Any]) -> str:
     """Format an overview of a system for a terminal.
 
     Args:
-        facts: What ``overview_of_system`` returned.
+        facts: Result of ``overview_of_system``.
 
     Returns:
         Lines of printable ASCII.
@@ -164,7 +164,7 @@ def _link(link: Mapping[str, Any]) -> str:
 
 
 def _change(gain: float, offset: float) -> str:
-    """What happens to a value on its way."""
+    """Describe the conversion of a value on its way."""
     parts = [f"* {gain:.6g}"] if gain != 1 else []
     if offset:
         parts.append(f"{'+' if offset > 0 else '-'} {abs(offset):.6g}")

@@ -1,4 +1,4 @@
-"""What the command line can run: task files, ids, classes and FMUs."""
+"""Targets of the command line: task files, ids, classes and FMUs."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ def maker_of(
     *,
     takes_fmu: bool = False,
 ) -> Callable[..., FMUEnv]:
-    """Find what a text names.
+    """Find the maker of the environment that a text names.
 
     Args:
         target: The path of a task file, a registered id, or ``"module:Class"``.
         scenario: A scenario of the task file; None for any episodes.
-        master: Of a system, in the place of what its archive or task says.
+        master: Master algorithm of a system, in the place of the one of its archive or task.
         takes_fmu: Whether the path of an FMU or an SSP archive will do, too. It stands for the task
             that ``fmugym new`` proposes, whose reward is a guess that somebody has to look at.
 
@@ -76,7 +76,7 @@ def maker_of(
 def player_maker(
     target: str, scenario: str | None = None, master: str | None = None
 ) -> Callable[..., FMUEnv]:
-    """Find what a text names, for commands that play episodes; see ``maker_of``.
+    """Find the maker for commands that play episodes; see ``maker_of``.
 
     The function refuses a task whose outputs contradict their limits; see ``require_units``.
     """
@@ -93,7 +93,7 @@ def player_maker(
 
 
 def _nearest(target: str) -> str:
-    """The file or id that was probably meant, in words."""
+    """Name the file or id that the user probably meant."""
     folder = Path(target).parent
     files = [str(path) for kind in ("*.toml", "*.fmu") for path in folder.glob(kind)]
     ids = [name for name in gymnasium.registry if name.startswith("fmugym/")]

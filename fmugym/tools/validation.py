@@ -1,4 +1,4 @@
-"""What is wrong with a task: checks of an environment, with cures.
+"""Validation of a task: checks of an environment, with cures.
 
 Unlike ``fmugym.testing``, which checks that a class keeps the contract of environments, these
 checks look for tasks that run but cannot be learned.
@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.arena import most_steps_of
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.candidate_evaluation import most_steps_of
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.parsing import controller_of, has_range, plans_ahead, simple_controllers
 from fmugym.baselines.table import ControllerTable
 from fmugym.baselines.table_texts import is_table, named_controllers, parts_of
@@ -31,14 +31,15 @@ from fmugym.episodes.simulation import action_of
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
 from fmugym.fmi.words import asked_for
+from fmugym.pool.base import FloatArray
 from fmugym.search.probe import MOST_PROBED
 from fmugym.search.search import tuning_steps
-from fmugym.series.choice import quantities_of
+from fmugym.series.recorded_quantities import quantities_of
 from fmugym.task.own_hooks import is_overridden
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import advise
-from fmugym.tools.findings import Advice, Finding, Report
+from fmugym.tools.findings import Advice, CheckResult, ValidationReport
 from fmugym.tools.response import advise_episodes
 from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
@@ -55,7 +56,7 @@ _SECONDS: Final = 5.0
 _STEPS_BEFORE_RESTORE: Final = 10
 
 _ENVS: Final = ((100e-6, 64), (1e-3, 16))
-"""How many environments share the effort of a call: by the seconds that a step takes at most."""
+"""Numbers of environments that share the effort of a call, by the largest seconds of a step."""
 
 _FEWEST_ENVS: Final = 8
 
@@ -70,12 +71,12 @@ _EXPLORED: Final = (0.1, 10.0)
 """Between these sizes are actions that they find by steps of about 1."""
 
 _UNEVEN: Final = "of very different sizes"
-"""How the finding about such observations begins, for which ``normalize`` is recommended."""
+"""Beginning of the finding for which ``normalize`` is recommended."""
 
 
 @dataclass(frozen=True)
 class _Episode:
-    """What an episode of a check gave; arrays have one row for each step, the reset first.
+    """Results of an episode of a check; arrays have one row for each step, the reset first.
 
     Attributes:
         observations: Shape (n + 1, k).
@@ -93,7 +94,7 @@ class _Episode:
     step_time: float
 
 
-def validate(make_env: Callable[[], FMUEnv]) -> Report:
+def validate(make_env: Callable[[], FMUEnv]) -> ValidationReport:
     """Check a task by some short episodes.
 
     Args:
@@ -121,27 +122,27 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
     checks = {one.check for one in more}
     before = (one for one in findings if one.verdict != "ok" or one.check not in checks)
     recommended |= {one.key: one.value for one in advices}
-    return Report(
+    return ValidationReport(
         (*before, *more), costs, hooks, recommended["reset_method"], recommended, tuple(advices)
     )
 
 
-def _repeated(replay: Replay, steps: int | None) -> tuple[list[Finding], list[Advice]]:
-    """What repetitions of an episode tell."""
+def _repeated(replay: Replay, steps: int | None) -> tuple[list[CheckResult], list[Advice]]:
+    """Check of repeated episodes."""
     found = list(advise(replay))
-    findings = [one for one in found if isinstance(one, Finding)]
+    findings = [one for one in found if isinstance(one, CheckResult)]
     advices = [one for one in found if isinstance(one, Advice)]
     known = {one.key for one in advices}
     for one in () if steps is None else advise_episodes(replay, steps):
         if one.key not in known:
             advices.append(one)
             if one.key == "episode_length":
-                findings.append(Finding("warning", "length", one.why, f"give {one.line}"))
+                findings.append(CheckResult("warning", "length", one.why, f"give {one.line}"))
     return findings, advices
 
 
 def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advice]:
-    """Lines for what other checks have found."""
+    """Advice that follows from other checks."""
     if recommended.get("normalize") and _has_limits(env.observation_space):
         yield Advice("agent", "normalize", True, f"observations are {_UNEVEN}")
     space: Any = env.action_space
@@ -175,9 +176,9 @@ def _restore_time(env: FMUEnv) -> float | None:
 
 
 def _recommended(
-    env: FMUEnv, step_time: float, hooks: str, findings: Sequence[Finding]
+    env: FMUEnv, step_time: float, hooks: str, findings: Sequence[CheckResult]
 ) -> dict[str, Any]:
-    """Settings that suit what was measured."""
+    """Settings that suit the measurements."""
     settings: dict[str, Any] = {"reset_method": env.reset_method}
     if hooks != "none":
         settings["envs"] = next((n for most, n in _ENVS if step_time < most), _FEWEST_ENVS)
@@ -218,7 +219,7 @@ def _flat(observation: Any) -> FloatArray:
     return np.asarray(observation, np.float64).reshape(-1)
 
 
-def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
+def _findings(env: FMUEnv, first: _Episode) -> Iterator[CheckResult]:
     yield _of_faults(first)
     if first.fault is not None and len(first.rewards) == 1:
         return  # nothing has moved: all else would only follow from that
@@ -241,26 +242,26 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_export(env)
 
 
-def _of_faults(first: _Episode) -> Finding:
+def _of_faults(first: _Episode) -> CheckResult:
     steps = len(first.rewards)
     if first.fault is None:
-        return Finding("ok", "run", f"{steps} steps with random actions")
+        return CheckResult("ok", "run", f"{steps} steps with random actions")
     cure = "narrow the limits of the actions, shorten the time step, or use more substeps"
     if "the reward" in first.fault or "_reward_policy" in first.fault:
         cure = "look for a division by 0, a logarithm, a root or a power in the reward"
     elif key := asked_for(first.fault):
         cure = f"set {key} in the config"
     text = f"step {steps} of random actions failed: {first.fault}"
-    return Finding("error", "run", text, cure)
+    return CheckResult("error", "run", text, cure)
 
 
-def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
+def _of_repetition(env: FMUEnv, first: _Episode) -> CheckResult:
     env.action_space.seed(0)
     again = _play(env, env.action_space.sample)
     count = min(len(first.observations), len(again.observations))
     if np.array_equal(first.observations[:count], again.observations[:count]):
-        return Finding("ok", "repetition", "the same seed gives the same episode")
-    return Finding(
+        return CheckResult("ok", "repetition", "the same seed gives the same episode")
+    return CheckResult(
         "error",
         "repetition",
         "the same seed gives another episode",
@@ -269,7 +270,7 @@ def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
     )
 
 
-def _of_actions(env: FMUEnv, pairs: Mapping[str, Sequence[_Episode]]) -> Iterator[Finding]:
+def _of_actions(env: FMUEnv, pairs: Mapping[str, Sequence[_Episode]]) -> Iterator[CheckResult]:
     """Compare episodes in which one action is at its lowest and its highest value."""
     unseen = [
         name
@@ -277,14 +278,14 @@ def _of_actions(env: FMUEnv, pairs: Mapping[str, Sequence[_Episode]]) -> Iterato
         if np.array_equal(low.observations, high.observations)
     ]
     if unseen:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "actions",
             f"no effect on observations: {', '.join(unseen)}",
             "leave them out, or name what they change in observations under [agent]",
         )
     elif _is_simple(env.action_space):
-        yield Finding("ok", "actions", "each action has an effect")
+        yield CheckResult("ok", "actions", "each action has an effect")
 
 
 def _is_simple(space: spaces.Space[Any]) -> bool:
@@ -327,23 +328,23 @@ def _differ(first: _Episode, second: _Episode) -> bool:
     return not same or not np.array_equal(first.rewards, second.rewards)
 
 
-def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
+def _of_parameters(env: FMUEnv) -> Iterator[CheckResult]:
     """Compare episodes with two values of each parameter of the task, or of all of an array."""
     given = {name: _numbers_of(env, name) for name in env.config.model_parameters}
     useless = [name for name, values in given.items() if not _has_effect(env, values)]
     if useless:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "parameters",
             f"without an effect: {', '.join(useless)}",
             "look for another parameter that the model uses, or leave them out",
         )
     elif given:
-        yield Finding("ok", "parameters", "each parameter of the task has an effect")
+        yield CheckResult("ok", "parameters", "each parameter of the task has an effect")
 
 
 def _numbers_of(env: FMUEnv, name: str) -> dict[str, Any]:
-    """What a parameter is, by scalars; nothing for Strings and structural parameters."""
+    """Numbers of a parameter by scalar; none for Strings and structural parameters."""
     known = env.interface.parameters
     scalars = env.fmu.description.scalars(name)
     return {v.name: known[v.name] for v in scalars if v.name in known}
@@ -379,7 +380,7 @@ def _two_values(env: FMUEnv, name: str, value: Any) -> list[Any]:
     return [value, 1.1 * value if value else 0.1]
 
 
-def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
+def _of_inputs(env: FMUEnv) -> Iterator[CheckResult]:
     """Tell the inputs of the FMU that nobody writes."""
     interface = env.interface
     written = {*interface.input_names, *interface.parameters}
@@ -392,7 +393,7 @@ def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
         and written.isdisjoint(one.name for one in variable.elements)
     ]
     if idle:
-        yield Finding(
+        yield CheckResult(
             "warning",
             "inputs",
             f"stay at their start values: {', '.join(idle)}",
@@ -400,7 +401,7 @@ def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
         )
 
 
-def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
+def _of_reward(first: _Episode, others: Sequence[_Episode]) -> CheckResult:
     rewards = first.rewards
     low, high = rewards.min(), rewards.max()
     if low == high:
@@ -420,12 +421,12 @@ def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
         text = f"from {low:.4g} to {high:.4g} with random actions, a difference of {high - low:.2g}"
         cure = f"multiply what differs by {factor:g}; only --algorithm minds"
     else:
-        return Finding("ok", "reward", f"from {low:.4g} to {high:.4g} with random actions")
-    return Finding("warning", "reward", text, cure)
+        return CheckResult("ok", "reward", f"from {low:.4g} to {high:.4g} with random actions")
+    return CheckResult("warning", "reward", text, cure)
 
 
 def _factor_of(rewards: FloatArray) -> float:
-    """What makes tiny rewards, or tiny differences, as large as 1; 0 if there are none."""
+    """Rounded factor that brings tiny rewards or differences near 1; 0 if none are tiny."""
     size, spread = np.abs(rewards).max(), np.ptp(rewards)
     tiny = size if size < _TINY else spread
     return rounded_down(1 / tiny) if 0.0 < tiny < _TINY * max(1.0, size) else 0.0
@@ -441,7 +442,7 @@ def _advice_of_reward(env: FMUEnv, rewards: FloatArray) -> Iterator[Advice]:
 
 
 def _document(env: FMUEnv) -> Mapping[str, Any]:
-    """What the task of an environment declares; nothing for a class without one."""
+    """Declarations of an environment's task; an empty dict for a class without a task."""
     task = getattr(env, "task", None)
     return task.document if isinstance(task, Task) else {}
 
@@ -463,17 +464,17 @@ def _misread(env: FMUEnv) -> list[Misreading]:
     return list(misreadings(env, seen))
 
 
-def _of_units(misread: Sequence[Misreading]) -> Iterator[Finding]:
-    """Tell what the FMU seems to mean by numbers to which it gives no unit."""
+def _of_units(misread: Sequence[Misreading]) -> Iterator[CheckResult]:
+    """Report likely units of numbers to which the FMU gives no unit."""
     for one in misread:
         verdict = "warning" if one.is_converted else "ok"
         verdict = "error" if one.contradicts else verdict
-        yield Finding(verdict, "units", one.text, f"write {one.line} under [variables]")
+        yield CheckResult(verdict, "units", one.text, f"write {one.line} under [variables]")
 
 
 def _of_observations(
     env: FMUEnv, first: _Episode, second: _Episode, misread: Sequence[Misreading]
-) -> Iterator[Finding]:
+) -> Iterator[CheckResult]:
     space, seen = env.observation_space, first.observations
     if not isinstance(space, spaces.Box):
         return
@@ -483,24 +484,24 @@ def _of_observations(
     if not _is_normalized(env):
         findings += _of_sizes(names, seen)
     findings += _of_still(env, names, np.concatenate([seen, second.observations]))
-    fine = Finding("ok", "observations", "within their limits, and of similar sizes")
+    fine = CheckResult("ok", "observations", "within their limits, and of similar sizes")
     yield from findings or [fine]
 
 
 def _is_normalized(env: FMUEnv) -> bool:
-    """Whether a task maps what the agent observes from its limits to -1 to 1."""
+    """Whether a task maps observations from their limits to the range from -1 to 1."""
     return _document(env).get("agent", {}).get("normalize") in (True, "limits")
 
 
 def _of_limits(
     env: FMUEnv, space: spaces.Box, names: tuple[str, ...], seen: Any, misread: Set[str]
-) -> Iterator[Finding]:
-    """Tell observations beyond their limits, but for those in another unit or with errors."""
+) -> Iterator[CheckResult]:
+    """Report observations beyond their limits, except those in another unit or with errors."""
     outside = ((seen < space.low.reshape(-1)) | (seen > space.high.reshape(-1))).any(axis=0)
     outside &= [name not in misread for name in names]
     if outside.any():
         listing = ", ".join(_range(env, names[i], seen[:, i]) for i in np.flatnonzero(outside))
-        yield Finding(
+        yield CheckResult(
             "warning", "observations", f"outside of their limits: {listing}", "widen min and max"
         )
 
@@ -524,11 +525,11 @@ def _range(env: FMUEnv, name: str, values: Any) -> str:
     return f"{name} ({values.min():.4g} to {values.max():.4g} {found.unit}".rstrip() + ")"
 
 
-def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
+def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[CheckResult]:
     sizes = np.abs(seen).max(axis=0)
     if sizes.max() > _WIDE * max(1.0, sizes.min()):
         largest = names[int(sizes.argmax())]
-        yield Finding(
+        yield CheckResult(
             "warning",
             "observations",
             f"{_UNEVEN}: {largest} reaches {sizes.max():.4g}",
@@ -536,7 +537,7 @@ def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
         )
 
 
-def _of_still(env: FMUEnv, names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
+def _of_still(env: FMUEnv, names: tuple[str, ...], seen: Any) -> Iterator[CheckResult]:
     """Tell continuous outputs that have one value in two episodes."""
     outputs = {one.name for one in quantities_of(env).all if one.kind == "output"}
     still = [
@@ -547,20 +548,20 @@ def _of_still(env: FMUEnv, names: tuple[str, ...], seen: Any) -> Iterator[Findin
     if still:
         text = f"never change, whatever the actions: {', '.join(still)}"
         cure = "leave them out of observations under [agent]"
-        yield Finding("warning", "observations", text, cure)
+        yield CheckResult("warning", "observations", text, cure)
 
 
 def _own_name(env: FMUEnv, name: str) -> str:
-    """What the FMU calls a variable that has a name in the task."""
+    """Name in the FMU of a variable that has another name in the task."""
     return str(_document(env).get("variables", {}).get(name, {}).get("name", name))
 
 
-def _of_length(env: FMUEnv) -> Finding:
+def _of_length(env: FMUEnv) -> CheckResult:
     steps, stop_time = most_steps_of(env), env.config.stop_time
     if steps is not None or stop_time is not None:
         what = f"at most {steps} steps" if steps is not None else f"until t = {stop_time} s"
-        return Finding("ok", "length", f"an episode takes {what}")
-    return Finding(
+        return CheckResult("ok", "length", f"an episode takes {what}")
+    return CheckResult(
         "warning",
         "length",
         "an episode has no limit of steps",
@@ -568,7 +569,7 @@ def _of_length(env: FMUEnv) -> Finding:
     )
 
 
-def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
+def _of_controllers(env: FMUEnv) -> Iterator[CheckResult]:
     """Tell whether each controller of the task file can act, and which actions none moves."""
     task = getattr(env, "task", None)
     if not isinstance(task, Task):
@@ -582,11 +583,11 @@ def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
     if texts and not wrong:
         tuned = ", ".join(name for name, one in texts.items() if has_range(one))
         more = f"; 'fmugym train' tunes {tuned} with {steps} each" if tuned else ""
-        yield Finding("ok", "controllers", f"each can act: {', '.join(texts)}{more}")
+        yield CheckResult("ok", "controllers", f"each can act: {', '.join(texts)}{more}")
     rest = [name for name in names if name not in moved]
     if len(names) > 1 and rest:
         table = ", ".join(f"{name} = ..." for name in names)
-        yield Finding(
+        yield CheckResult(
             "warning" if texts else "ok",
             "controllers",
             f"none of the file moves {', '.join(rest)}; ranges of one for all actions are tuned "
@@ -595,12 +596,12 @@ def _of_controllers(env: FMUEnv) -> Iterator[Finding]:
         )
 
 
-def _tried(env: FMUEnv, task: Task, texts: Mapping[str, Any]) -> tuple[list[Finding], set[str]]:
-    """What is wrong with controllers, and which actions they move.
+def _tried(env: FMUEnv, task: Task, texts: Mapping[str, Any]) -> tuple[list[CheckResult], set[str]]:
+    """Check controllers: their mistakes, and the actions that they move.
 
     Those that stand in tables, or act in the warm-up, need not fit all actions.
     """
-    wrong, moved, parts = list[Finding](), set[str](), _parts(task)
+    wrong, moved, parts = list[CheckResult](), set[str](), _parts(task)
     given_to_env = {} if env.spec is None else env.spec.kwargs
     master = {name: one for name, one in given_to_env.items() if name == "master"}
     with closing(load(task.physical(), **master)) as physical:
@@ -610,7 +611,7 @@ def _tried(env: FMUEnv, task: Task, texts: Mapping[str, Any]) -> tuple[list[Find
                     moved.update(_moved(_bound(physical, text), env.action_names or ()))
             except FMUGymError as error:
                 cure = "let it measure what the agent observes, and give a number for each action"
-                found = Finding("error", "controllers", str(error), cure)
+                found = CheckResult("error", "controllers", str(error), cure)
                 wrong += [] if name in parts else [found]
     return wrong, moved
 
@@ -623,7 +624,7 @@ def _parts(task: Task) -> set[Any]:
 
 
 def _bound(env: FMUEnv, given: Any) -> Controller | None:
-    """A controller that has found what it needs; None for a constant action.
+    """Bind a controller; returns None for a constant action.
 
     The copies that an MPC plans with take too long.
     """
@@ -640,39 +641,39 @@ def _bound(env: FMUEnv, given: Any) -> Controller | None:
 
 
 def _moved(controller: Controller | None, names: Sequence[str]) -> Sequence[str]:
-    """Which of the actions a bound controller moves."""
+    """Actions that a bound controller moves."""
     if isinstance(controller, ControllerTable):
         return controller.moved
     return () if controller is None else names
 
 
-def _of_hooks(env: FMUEnv) -> Iterator[Finding]:
+def _of_hooks(env: FMUEnv) -> Iterator[CheckResult]:
     """Tell whether the hooks of a class work on arrays, and whether the class says so."""
     if is_overridden(env, "step") or is_overridden(env, "reset") or not own_hooks(env):
         return
     difference, hook = no_arrays(env) or find_difference(env), hook_of_one(type(env))
     if difference is None and hook is None:
-        yield Finding("ok", "hooks", "they give on arrays what they give one by one")
+        yield CheckResult("ok", "hooks", "they give on arrays what they give one by one")
     elif difference is None:
         text = f"{hook} works on arrays, but its class does not say so"
-        yield Finding("warning", "hooks", text, "write vectorized = True in the class")
+        yield CheckResult("warning", "hooks", text, "write vectorized = True in the class")
     elif hook is None:
         cure = f"{CURE}; or take vectorized = True out of the class"
-        yield Finding("error", "hooks", difference, cure)
+        yield CheckResult("error", "hooks", difference, cure)
     else:
         text = f"a vector environment calls them one by one: {difference}"
-        yield Finding("warning", "hooks", text, f"{CURE}, and vectorized = True")
+        yield CheckResult("warning", "hooks", text, f"{CURE}, and vectorized = True")
 
 
-def _of_export(env: FMUEnv) -> Finding:
+def _of_export(env: FMUEnv) -> CheckResult:
     """Tell before the training whether its agent can leave Python."""
     try:
         measured = [variable.name for variable in logic_of(env).measurements]
     except FMUGymError as error:
         cure = "an agent acts in Python all the same; docs/deploy.md says what can be exported"
-        return Finding("warning", "export", str(error), cure)
+        return CheckResult("warning", "export", str(error), cure)
     names = ", ".join(measured) or "nothing"
-    return Finding("ok", "export", f"an agent can be exported; it measures {names}")
+    return CheckResult("ok", "export", f"an agent can be exported; it measures {names}")
 
 
 def _hooks(make_env: Callable[[], FMUEnv]) -> str:

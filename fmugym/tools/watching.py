@@ -1,4 +1,4 @@
-"""How far a command is: a bar in a terminal, otherwise a line now and then."""
+"""Progress of a command: a bar in a terminal, otherwise a line now and then."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from time import monotonic
 from typing import Final
 
-from fmugym.episodes.progress_bars import Advance, no_progress, progress
+from fmugym.episodes.progress_bars import Advance, no_progress, progress_bar
 from fmugym.tools.options import tell
 
 __all__ = ["watched"]
@@ -21,23 +21,23 @@ _HOUR: Final = 3600.0
 def watched(
     total: float | None, what: str, unit: str = "", clock: Callable[[], float] | None = None
 ) -> Iterator[Advance]:
-    """Show how far something is, and how long the rest may take.
+    """Show the progress of a command, and the time that the rest may take.
 
     Args:
         total: All that is to be done; None if that is not known.
         what: A word for it.
-        unit: What is counted; "" if only parts are shown.
+        unit: Name of the counted things; "" if only parts are shown.
         clock: Tells seconds; that of the system by default.
 
     Yields:
         A function that is told what was done since the last call, and perhaps a text to show.
     """
-    with progress(total, what, unit) as advance:
+    with progress_bar(total, what, unit) as advance:
         yield advance if advance is not no_progress else _lines(total, what, clock or monotonic)
 
 
 def _lines(total: float | None, what: str, clock: Callable[[], float]) -> Advance:
-    """Tell every ten seconds what it is told, or which part is done."""
+    """Print progress every ten seconds: a text, or the part that is done."""
     begin = last = clock()
     done = 0.0
 

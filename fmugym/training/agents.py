@@ -19,16 +19,16 @@ from fmugym.baselines import Controller
 from fmugym.checks import check_option, check_path, require_regular
 from fmugym.env import FMUEnv
 from fmugym.episodes.simulation import Player, Policy, policy_of_controller
-from fmugym.errors import ConfigError, reading, shown
+from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.extras import imported
 from fmugym.files import replaced_together
 from fmugym.scaling import are_scaled, unscaled
-from fmugym.search.policy import AGENT, Agent, require_task
+from fmugym.search.policy import POLICY_FILE, ResidualAgent, require_task
 from fmugym.search.residual import Residual
 from fmugym.training.residuals import residual_of
 
 __all__ = [
-    "FACTS",
+    "AGENT_FILE",
     "agent_player",
     "algorithm_of",
     "imported_for_training",
@@ -42,7 +42,7 @@ __all__ = [
 
 _LIBRARIES: Final = ("stable_baselines3", "sb3_contrib")
 _MODEL, _NORMALIZATION = "model.zip", "normalization.pkl"
-FACTS: Final = "agent.json"
+AGENT_FILE: Final = "agent.json"
 
 
 def imported_for_training(name: str) -> Any:
@@ -84,7 +84,7 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
         model.save(beside(folder / _MODEL))
         if normalization is not None:
             normalization.save(str(beside(folder / _NORMALIZATION)))
-        beside(folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
+        beside(folder / AGENT_FILE).write_text(json.dumps(dict(facts)), encoding="utf-8")
 
 
 def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
@@ -104,7 +104,7 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
     """
     path = check_path("folder", folder)
     model, normalization = read_agent(path)
-    if isinstance(model, Agent):
+    if isinstance(model, ResidualAgent):
         return model.policy()
     if isinstance(model, Residual):
         return model
@@ -112,7 +112,7 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
 
 
 def agent_player(folder: Path) -> Player:
-    """The one who acts as the agent in a folder; raises as ``load_agent``."""
+    """Make the player of the agent in a folder; raises as ``load_agent``."""
     agent = load_agent(folder)
     return Player(partial(policy_of_controller, agent), agent.is_physical)
 
@@ -121,10 +121,10 @@ class TrainedModel:
     """An agent of Stable-Baselines3, with the methods of a ``fmugym.baselines.Controller``.
 
     Args:
-        folder: Where it comes from, for errors.
+        folder: Folder of the agent, for errors.
         model: The model.
         normalization: Its ``VecNormalize``, or None.
-        facts: What ``save`` was told.
+        facts: Facts that ``save`` was given.
     """
 
     is_physical: Final = False
@@ -154,7 +154,7 @@ class TrainedModel:
         return self
 
     def _require_names(self, env: FMUEnv) -> None:
-        """Refuse other names than those of the training, if these are known."""
+        """Refuse names other than those of the training, if these are known."""
         here = names_of(env)
         own = {what: self._facts.get(what, names) for what, names in here.items()}
         tasks = ((one["observations"], ", ".join(one["actions"])) for one in (own, here))
@@ -185,12 +185,12 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
-    if (path / AGENT).exists():
-        return Agent.load(path), None
+    if (path / POLICY_FILE).exists():
+        return ResidualAgent.load(path), None
     file = path if path.is_file() else path / _MODEL
     facts: dict[str, Any] = {"algorithm": algorithm} if path.is_file() else _facts_in(path)
     kind = algorithm_of(facts["algorithm"])
-    with reading(f"the agent in {shown(str(path))} cannot be read"):
+    with reading_file(f"the agent in {shown(str(path))} cannot be read"):
         require_regular(file)
         model, normalization = kind.load(file, device="cpu"), _normalization_in(file.parent)
         if facts.get("residual") is None:
@@ -200,14 +200,14 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
 
 
 def _facts_in(folder: Path) -> dict[str, Any]:
-    return read_facts(folder, FACTS, "is no folder of 'fmugym train'", "algorithm")
+    return read_facts(folder, AGENT_FILE, "is no folder of 'fmugym train'", "algorithm")
 
 
 def read_facts(folder: Path, name: str, what_is_wrong: str, *needed: str) -> dict[str, Any]:
     """Read a file of facts.
 
     Args:
-        folder: Where it is.
+        folder: Folder of the agent.
         name: Its name.
         what_is_wrong: What the error says of the folder.
         needed: The facts that must be there.
@@ -243,13 +243,13 @@ def _kind(space: Any) -> str:
 
 
 def names_of(env: FMUEnv) -> dict[str, list[str]]:
-    """The names of what an agent observes and of the inputs that it writes."""
+    """Names of an agent's observations, and of the inputs that it writes."""
     seen = env.observation_names or env.config.model_output_names
     return {"observations": list(seen), "actions": list(env.config.model_input_names)}
 
 
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:
-    """Make the policy that a model is: its best action, and masked ones only where it knows masks.
+    """Make the policy of a model: its best action, masked only if it knows masks.
 
     Actions from -1 to 1 stand for the ranges of the environment's.
 

@@ -1,4 +1,4 @@
-"""Trainings that go on: everything that the next step of a training depends on, in files.
+"""Checkpoints: files with everything on which the next step of a training depends.
 
 A checkpoint is made between two updates of the agent. It has the model with its optimizer, the
 replay buffer, the normalization, the FMUs with their random streams (``FMUVectorEnv.save_state``),
@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import FMUGymError, reading, shown
+from fmugym.errors import FMUGymError, reading_file, shown
 from fmugym.files import write_whole
 from fmugym.training.agents import algorithm_of, read_facts
 
@@ -41,10 +41,10 @@ def save_checkpoint(folder: Path, model: Any, venv: Any, more: dict[str, Any]) -
     """Write a checkpoint; the one before stays until this one is complete.
 
     Args:
-        folder: That of the training.
+        folder: Folder of the training.
         model: The model of Stable-Baselines3.
         venv: Its environments: wrappers around a ``FMUVecEnv``.
-        more: What else to keep; it must be possible to pickle it.
+        more: Further objects to keep; it must be possible to pickle it.
     """
     place = _new_place(folder, int(model.num_timesteps))
     try:
@@ -119,7 +119,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, int]:
         ConfigError: If there is none.
     """
     facts = read_facts(folder, CHECKPOINT, NOTHING_TO_RESUME, "folder", "steps")
-    with reading(f"{shown(str(folder))} {NOTHING_TO_RESUME}"):
+    with reading_file(f"{shown(str(folder))} {NOTHING_TO_RESUME}"):
         return folder / facts["folder"], int(facts["steps"])
 
 
@@ -129,7 +129,7 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
     Only load checkpoints from sources that you trust: the files hold pickles, which can run code.
 
     Args:
-        folder: That of the training.
+        folder: Folder of the training.
         algorithm: The name of the algorithm.
         venv: The same environments as before, which are brought to where they were.
 
@@ -140,7 +140,7 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
         ConfigError: If there is none, its files are damaged, or it is of another task.
     """
     place, _ = latest_checkpoint(folder)
-    with reading(f"the checkpoint in {shown(str(folder))} cannot be resumed"):
+    with reading_file(f"the checkpoint in {shown(str(folder))} cannot be resumed"):
         return _loaded(place, algorithm, venv)
 
 

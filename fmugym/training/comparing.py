@@ -1,4 +1,4 @@
-"""Who has won: agents play episodes that no search has seen."""
+"""Comparison of agents over episodes that no search has seen."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, Outcome
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, CandidateScores
 from fmugym.episodes.evaluation import HELD_OUT_SEED
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.series.intervals import confidence
 
 __all__ = ["judge", "verdict"]
 
 
 def judge(
-    agents: Mapping[str, Agent],
-    arenas: Mapping[str, Arena],
+    agents: Mapping[str, ResidualAgent],
+    evaluators: Mapping[str, CandidateEvaluator],
     episodes: int,
     leave_out: Callable[[str, Exception], None],
     advance: Callable[[str, float], None] = lambda name, part: None,
@@ -27,7 +27,7 @@ def judge(
 
     Args:
         agents: By name.
-        arenas: Those of the scenarios, by name; they are closed.
+        evaluators: Evaluators of the scenarios, by name; they are closed.
         episodes: How many episodes of each scenario.
         leave_out: Is told of an agent that cannot play to the end, or of a scenario that cannot be
             opened, by name and with the reason. The others play all the same.
@@ -39,28 +39,30 @@ def judge(
         ``mean_costs`` by name, with the part of ``failed episodes``, which a fault has cut short.
     """
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes)
-    played: dict[str, list[Outcome]] = {name: [] for name in agents}
+    played: dict[str, list[CandidateScores]] = {name: [] for name in agents}
     opened = []
-    for scenario, arena in arenas.items():
-        with closing(arena):
+    for scenario, evaluator in evaluators.items():
+        with closing(evaluator):
             try:
-                arena.open(len(seeds))
+                evaluator.open(len(seeds))
             except Exception as error:
-                leave_out(f"scenario {scenario}" if len(arenas) > 1 else scenario, error)
+                leave_out(f"scenario {scenario}" if len(evaluators) > 1 else scenario, error)
                 continue
             opened.append(scenario)
             for name in list(played):
-                arena.advance = lambda part, name=name: advance(name, part / len(arenas))  # type: ignore[misc]
+                evaluator.advance = lambda part, name=name: advance(name, part / len(evaluators))  # type: ignore[misc]
                 try:
-                    played[name].append(agents[name].play(arena, seeds))
+                    played[name].append(agents[name].play(evaluator, seeds))
                 except Exception as error:
                     leave_out(name, error)
                     del played[name]
-                    arena.close()  # its episodes are in the middle of something
+                    evaluator.close()  # its episodes are in the middle of something
     return _told(played if opened else {}, opened)
 
 
-def _told(played: Mapping[str, Sequence[Outcome]], scenarios: Sequence[str]) -> dict[str, Any]:
+def _told(
+    played: Mapping[str, Sequence[CandidateScores]], scenarios: Sequence[str]
+) -> dict[str, Any]:
     test = {}
     for name, outcomes in played.items():
         costs = np.mean([one.costs for one in outcomes], axis=(0, 1, 2)).tolist()
@@ -74,11 +76,11 @@ def _told(played: Mapping[str, Sequence[Outcome]], scenarios: Sequence[str]) -> 
 
 
 def verdict(test: Mapping[str, Any], limits: Mapping[str, float]) -> str:
-    """Say who has won, in a line: the first agent beside the second one.
+    """Describe the result in a line: the first agent beside the second one.
 
     Args:
-        test: What ``judge`` has returned.
-        limits: What each cost may add up to in an episode, by name.
+        test: Result of ``judge``.
+        limits: Limits of the costs of an episode, by name.
     """
     first, *others = test
     text = ", ".join(f"{name} {one['total_reward']:.6g}" for name, one in test.items())
@@ -90,7 +92,7 @@ def verdict(test: Mapping[str, Any], limits: Mapping[str, float]) -> str:
 
 
 def _beside(test: Mapping[str, Any], name: str, other: str) -> str:
-    """One agent beside another one; per cent only of totals of one sign and one magnitude.
+    """Compare an agent with another one, in per cent only for totals of one sign and magnitude.
 
     The interval is that of the differences in each episode, beside their mean in the scenario.
     """

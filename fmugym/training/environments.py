@@ -1,4 +1,4 @@
-"""How many environments of a training step together."""
+"""Number of environments that a training steps together."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHARE: Final = 0.5
 
 
 def fitting_envs(make_env: Callable[[], FMUEnv]) -> int:
-    """How many environments step together, as processors and memory allow.
+    """Number of environments that fit the processors and the memory.
 
     Args:
         make_env: A function that makes the environment. One takes some steps.

@@ -1,4 +1,4 @@
-"""Search for good arguments of an algorithm, with Optuna."""
+"""Tuning of hyperparameters of an algorithm, with Optuna."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any, Final
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
 from fmugym.training.agents import algorithm_of
-from fmugym.training.diary import note
 from fmugym.training.training import TRIALS, TrainingSettings, Watch, require_new, train
+from fmugym.training.training_records import append_row
 
-__all__ = ["tune"]
+__all__ = ["tune_hyperparameters"]
 
 _FACTORS: Final = (0.25, 0.5, 1, 2, 4)
 _COUNTS: Final = ("n_steps", "batch_size", "n_epochs", "train_freq")
@@ -37,7 +37,7 @@ _PARTS: Final = 4
 """A trial has at least so many updates."""
 
 
-def tune(
+def tune_hyperparameters(
     settings: TrainingSettings, trials: int, steps: int, tell: Callable[[str], None]
 ) -> dict[str, Any]:
     """Try arguments of the algorithm in short trainings.
@@ -47,7 +47,7 @@ def tune(
     own, ``trials/000`` and so on, and in a line of ``trials.csv``.
 
     Args:
-        settings: What to train. Arguments that it has are not searched for.
+        settings: Settings of the training. Arguments that it has are not searched for.
         trials: How many to make.
         steps: The steps of a trial.
         tell: Gets a line of text for each trial.
@@ -97,13 +97,13 @@ def _best_reward(
             raise pruned
 
     folder = settings.folder / TRIALS / f"{trial.number:03}"
-    own = replace(settings, folder=folder, steps=steps, arguments=arguments, diary=None)
+    own = replace(settings, folder=folder, steps=steps, arguments=arguments, records=None)
     train(own, watch=Watch(evaluated=evaluated))
     return max(rewards)
 
 
 def _suggested(trial: Any, settings: TrainingSettings, steps: int) -> dict[str, Any]:
-    """Arguments for a trial, of those that the algorithm has and the settings do not give."""
+    """Suggest arguments for a trial that the algorithm has and the settings do not give."""
     given = settings.arguments or {}
     defaults = {
         name: parameter.default
@@ -146,4 +146,4 @@ def _note(settings: TrainingSettings, trial: Any) -> None:
     arguments = json.dumps(trial.user_attrs.get("arguments", {}))
     row = [trial.number, trial.state.name.lower(), trial.value, arguments]
     settings.folder.mkdir(parents=True, exist_ok=True)
-    note(settings.folder, ("trial", "state", "reward", "arguments"), row, f"{TRIALS}.csv")
+    append_row(settings.folder, ("trial", "state", "reward", "arguments"), row, f"{TRIALS}.csv")

@@ -1,4 +1,4 @@
-"""What is left of a training for people to look at: the learning curve, and a report."""
+"""Results of a training for readers: the learning curve, and a report."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from fmugym.errors import ConfigError
 from fmugym.files import replaced
 from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.plots import svg_of
-from fmugym.training.agents import FACTS, agent_player
-from fmugym.training.diary import CURVE, REPORT, Diary, curve_of, draw_curve
+from fmugym.training.agents import AGENT_FILE, agent_player
 from fmugym.training.training import TrainingSettings
+from fmugym.training.training_records import CURVE, REPORT, TrainingRecords, curve_of, draw_curve
 
 __all__ = ["write_curve", "write_outcome"]
 
@@ -29,20 +29,20 @@ def write_outcome(settings: TrainingSettings, title: str, tell: Callable[[str], 
     Files that are there are replaced. Without Matplotlib there are none.
 
     Args:
-        settings: What was trained.
-        title: What the task is called.
+        settings: Settings of the training.
+        title: Title of the task.
         tell: Gets a line of text if Matplotlib is missing.
     """
     figure = write_curve(settings.folder, f"{title}, trained with {settings.algorithm}", tell)
-    if figure is not None and settings.diary is not None:
-        _write_report(settings, settings.diary, title, {"Training": svg_of(figure)})
+    if figure is not None and settings.records is not None:
+        _write_report(settings, settings.records, title, {"Training": svg_of(figure)})
 
 
 def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
     """Draw the curve of a training.
 
     Args:
-        folder: That of the training. A picture that is there is replaced.
+        folder: Folder of the training. A picture that is there is replaced.
         title: A line of text above.
         tell: Gets a line of text if Matplotlib is missing.
 
@@ -62,15 +62,15 @@ def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
 
 
 def _write_report(
-    settings: TrainingSettings, diary: Diary, title: str, charts: Mapping[str, str]
+    settings: TrainingSettings, records: TrainingRecords, title: str, charts: Mapping[str, str]
 ) -> None:
     """Let the best agent play once more, in the first episode of each evaluation."""
     runs = {
-        name: _played(settings, diary, make_env) for name, make_env in settings.held_out.items()
+        name: _played(settings, records, make_env) for name, make_env in settings.held_out.items()
     }
     with closing(settings.make_env()) as env:
         about = About.of(env)
-    best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
+    best = json.loads((settings.folder / AGENT_FILE).read_text(encoding="utf-8"))
     facts = {
         "algorithm": settings.algorithm,
         "arguments": ", ".join(f"{k} = {v}" for k, v in (settings.arguments or {}).items())
@@ -91,10 +91,12 @@ def _write_report(
         )
 
 
-def _played(settings: TrainingSettings, diary: Diary, make_env: Callable[[], FMUEnv]) -> TimeSeries:
+def _played(
+    settings: TrainingSettings, records: TrainingRecords, make_env: Callable[[], FMUEnv]
+) -> TimeSeries:
     player = agent_player(settings.folder)
     env = player.make_env(make_env)
-    with closing(RecordSeries(env, diary.variables, every=diary.every)) as recorder:
+    with closing(RecordSeries(env, records.variables, every=records.every)) as recorder:
         policy = player.make_policy(env)
         simulate(recorder, policy, HELD_OUT_SEED, settings.most_steps)
         return recorder.series

@@ -1,4 +1,4 @@
-"""Trainings of residual policies: what they begin with, and what folders keep of them."""
+"""Trainings of residual policies: their controllers, and their facts in folders."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def residual_facts(
     scale: float,
     tell: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """What a training and the folder of its agent keep. Ranges of the controller are tuned.
+    """Facts of a training and of its agent's folder; ranges of the controller are tuned.
 
     Args:
         make_env: Makes the environment; its task has the controller.
-        name: Of a controller of the task, or the text of one.
+        name: Name of a controller of the task, or the text of one.
         scale: The part of the range that is added to its action at most.
         tell: Gets lines of text.
 

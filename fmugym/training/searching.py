@@ -1,4 +1,4 @@
-"""Training without gradients: a search of policies, its course on disk, and its result."""
+"""Training by a search of policies: rounds, files in its folder, and the result."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
-from fmugym.baselines.entrants import NO_MERIT
+from fmugym.baselines.candidate_evaluation import MOST_ENVS, CandidateEvaluator, CeilingError
+from fmugym.baselines.candidate_search import NO_MERIT
 from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
-from fmugym.errors import ConfigError, reading, reason, shown
+from fmugym.errors import ConfigError, reading_file, reason, shown
 from fmugym.files import replaced_together
 from fmugym.pool.processors import available_processors
 from fmugym.search.guessing import MOST_TESTED
-from fmugym.search.policy import AGENT, Agent
-from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
+from fmugym.search.policy import POLICY_FILE, ResidualAgent
+from fmugym.search.probe import FEW, MOST_PROBED, Probe, agent_task
 from fmugym.search.search import Search
 from fmugym.search.search_file import bytes_of, plain_of, search_in
 from fmugym.surrogate.courses import Courses
-from fmugym.training.agents import FACTS
+from fmugym.training.agents import AGENT_FILE
 from fmugym.training.comparing import judge, verdict
-from fmugym.training.diary import note
 from fmugym.training.environments import VERY_SLOW
 from fmugym.training.training import require_new
+from fmugym.training.training_records import append_row
 from fmugym.training.twin import TwinSearch
 
 __all__ = ["STATE", "Searching"]
@@ -72,24 +72,24 @@ _OF_SCENARIO: Final = 4
 """Episodes of a test, and of each scenario if the task has some."""
 
 _TRIED: Final = 2
-"""Steps that tell how long a controller takes that plans ahead."""
+"""Steps that measure the time of a controller that plans ahead."""
 
 
 @dataclass
 class Searching:
-    """A search, which writes what it finds to a folder and tests it.
+    """Run of a search, which writes its results to a folder and tests them.
 
     Attributes:
         make_env: Makes the environment, in the physical form of its task.
         scenarios: By name, functions that make the environments of the test.
-        folder: Where the agent is written; it must not exist, unless a search is resumed.
+        folder: Folder of the new agent; it must not exist, unless a search is resumed.
         minutes: Real time of all but the test; None for one minute, or no limit if there are
             rounds.
         rounds: The largest number of rounds, those of a resumed search included.
         steps: The largest number of steps of all environments together, in all but the test.
         envs: The largest number of environments that step together.
-        seed: Of candidates and episodes.
-        episodes: Of the test, in each scenario; None for the default.
+        seed: Seed of candidates and episodes.
+        episodes: Number of episodes of the test, in each scenario; None for the default.
         tell: Gets lines of text.
         advance: Is told after each round of the seconds since the last one, and of the scores.
         progress: Shows how far a part of the work is, of which it gets the seconds that it takes
@@ -139,9 +139,11 @@ class Searching:
         self._probe, self._before = self._found.probe, self._found.steps
         self._tell_the_plan(resume)
         try:
-            with closing(self._arena_of(self.make_env, self._probe.most_steps)) as self._arena:
-                self._arena.steps = self._before
-                self._arena.backend = self._courses if self._on_surrogate else "auto"
+            with closing(
+                self._evaluator_of(self.make_env, self._probe.most_steps)
+            ) as self._evaluator:
+                self._evaluator.steps = self._before
+                self._evaluator.backend = self._courses if self._on_surrogate else "auto"
                 winner = self._winner()
             return self._judged(winner)
         finally:
@@ -169,10 +171,10 @@ class Searching:
             ConfigError: If there is none, it is damaged, or it is of another task.
         """
         name = shown(str(self.folder))
-        with reading(f"{name} has no search to resume"):
+        with reading_file(f"{name} has no search to resume"):
             found = search_in((self.folder / STATE).read_bytes())
         with closing(self.make_env()) as env:
-            before, now = plain_of(found.probe.task), plain_of(task_of(env))
+            before, now = plain_of(found.probe.task), plain_of(agent_task(env))
         changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
         if changed:
             raise ConfigError(
@@ -180,14 +182,14 @@ class Searching:
             )
         return found
 
-    def _arena_of(self, make_env: Callable[[], Any], most_steps: int) -> Arena:
+    def _evaluator_of(self, make_env: Callable[[], Any], most_steps: int) -> CandidateEvaluator:
         seconds, group = self._probe.seconds, self.envs
         if seconds > _SLOW:
             group = min(group, _GROUP if seconds < VERY_SLOW else available_processors())
-        return Arena(make_env, group, most_steps, self._probe.limits)
+        return CandidateEvaluator(make_env, group, most_steps, self._probe.limits)
 
     def _tell_the_plan(self, is_resumed: bool) -> None:
-        """Tell what will be done, and how long."""
+        """Tell the plan and its duration."""
         probe = self._probe
         took = probe.round_time(self._found.episodes)
         left = self.seconds - (monotonic() - self._begin)
@@ -224,7 +226,7 @@ class Searching:
         with closing(self.make_env()) as env:
             return env.pool_opening.backend is None
 
-    def _winner(self) -> Agent:
+    def _winner(self) -> ResidualAgent:
         """Search, and find the winner of the last validation.
 
         What was found is written also if an exception ends the search.
@@ -241,8 +243,8 @@ class Searching:
             if self._found.ahead.merit > NO_MERIT:
                 self._save(self._found.ahead.best)
         self.tell(self._text())
-        self._arena.ceiling = self.steps
-        winner = self._found.winner(self._arena)
+        self._evaluator.ceiling = self.steps
+        winner = self._found.winner(self._evaluator)
         if winner is None:
             raise ConfigError(
                 f"{self._found.rounds} rounds are too few to find anything: give more --minutes, "
@@ -251,7 +253,7 @@ class Searching:
         self._save(winner)
         return winner
 
-    def _proved(self) -> Agent:
+    def _proved(self) -> ResidualAgent:
         """Search on a surrogate of the FMU, and find the agent that is best on the FMU.
 
         What was found is written also if an exception ends the search.
@@ -261,7 +263,7 @@ class Searching:
         steps = min(self.steps, _MOST_OF_FMU, self._before + left / 2 / self._probe.seconds)
         twin = TwinSearch(
             self._found,
-            self._arena,
+            self._evaluator,
             self._courses,
             self.steps if limited else steps,
             np.inf if limited else left,
@@ -284,19 +286,19 @@ class Searching:
         longest = 0.0
         while not self._is_over(longest):
             begin, before = monotonic(), self._found
-            self._arena.ceiling = self.steps - self._reserved(before)
+            self._evaluator.ceiling = self.steps - self._reserved(before)
             found = copy.deepcopy(before)
             try:
-                found.advance(self._arena)
+                found.advance(self._evaluator)
             except CeilingError:
                 return
-            if self._arena.steps > self.steps - self._reserved(found):
+            if self._evaluator.steps > self.steps - self._reserved(found):
                 return
             self._found = found
             ahead, base = found.ahead, found.baseline
             if base and (before.baseline is None or ahead.merit > before.ahead.merit):
-                row = self._arena.steps, ahead.merit[1], base.merit[1]
-                note(self.folder, ("steps", "reward", "baseline"), row)
+                row = self._evaluator.steps, ahead.merit[1], base.merit[1]
+                append_row(self.folder, ("steps", "reward", "baseline"), row)
                 self._save(ahead.best)
             took = monotonic() - begin
             longest = max(longest, took)
@@ -313,9 +315,9 @@ class Searching:
         goes_on = self._is_enough or found.tuning or found.baseline
         if found.is_over or found.rounds >= self.rounds or not goes_on:
             return True
-        done, seconds = self._arena.steps - self._before, monotonic() - self._begin
+        done, seconds = self._evaluator.steps - self._before, monotonic() - self._begin
         # all episodes may end before they are as long as they may be
-        pace = seconds / (done or 1) * self._arena.longest / self._probe.most_steps
+        pace = seconds / (done or 1) * self._evaluator.longest / self._probe.most_steps
         return seconds + longest + self._reserved(found) * pace >= self.seconds
 
     def _text(self) -> str:
@@ -325,10 +327,10 @@ class Searching:
         text += f", best {ahead.merit[1]:.6g}" if ahead.merit > NO_MERIT else ""
         return text + (f", {base.best.name} {base.merit[1]:.6g}" if base else "")
 
-    def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
+    def _save(self, agent: ResidualAgent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
         found, task = self._found, self._probe.task
-        found.steps = self._arena.steps
+        found.steps = self._evaluator.steps
         facts = {
             "algorithm": "search",
             "agent": agent.name,
@@ -342,48 +344,51 @@ class Searching:
         }
         named = replace(agent, names=task["observations"], actions=task["actions"])
         with replaced_together() as beside:
-            beside(self.folder / AGENT).write_bytes(named.content())
+            beside(self.folder / POLICY_FILE).write_bytes(named.content())
             if not self._on_surrogate:  # whose search cannot be resumed
                 beside(self.folder / STATE).write_bytes(bytes_of(found))
-            beside(self.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
+            beside(self.folder / AGENT_FILE).write_text(json.dumps(facts), encoding="utf-8")
         return facts
 
-    def _judged(self, winner: Agent) -> dict[str, Any]:
-        """Let the winner play beside the others, and write what it has reached."""
+    def _judged(self, winner: ResidualAgent) -> dict[str, Any]:
+        """Compare the winner with the others, and write the result."""
         probe, found = self._probe, self._found
         baseline = found.baseline.best if found.baseline else winner
         if found.baseline and winner is baseline:
             self.tell(f"nothing was found that beats {winner.name}: the folder has that controller")
-        arenas = {
-            name: self._arena_of(make, probe.most_steps if make is self.make_env else _LONGEST)
+        evaluators = {
+            name: self._evaluator_of(make, probe.most_steps if make is self.make_env else _LONGEST)
             for name, make in self.scenarios.items()
         }
-        usual = _EPISODES if len(arenas) < 2 else _OF_SCENARIO
+        usual = _EPISODES if len(evaluators) < 2 else _OF_SCENARIO
         count = 1 if probe.is_same else self.episodes or usual
         if self._on_surrogate and self.episodes is None and self.minutes:
-            most = self.seconds / _OF_TEST / probe.seconds / probe.most_steps / len(arenas)
+            most = self.seconds / _OF_TEST / probe.seconds / probe.most_steps / len(evaluators)
             count = min(count, max(_FEWEST_TESTED, int(most)))
         agents = {winner.name: winner}
-        planners = self._planners(baseline.text, count * len(arenas))
+        planners = self._planners(baseline.text, count * len(evaluators))
         others = (one.best for one in found.controllers)
         for other in filter(None, [baseline, *others, *planners]):
             agents.setdefault(other.name, other)
-        test = self._test(agents, arenas, count)
+        test = self._test(agents, evaluators, count)
         text = f"no verdict: {winner.name} could not play the test"
         if winner.name in test:
             text = verdict(test, probe.limits)
         return self._save(winner, test=test, verdict=text)
 
     def _test(
-        self, agents: Mapping[str, Agent], arenas: Mapping[str, Arena], count: int
+        self,
+        agents: Mapping[str, ResidualAgent],
+        evaluators: Mapping[str, CandidateEvaluator],
+        count: int,
     ) -> dict[str, Any]:
-        """Let agents play, and show how far they are; nothing that one does ends the test."""
-        usual = self._probe.seconds * self._probe.usual_steps * count * len(arenas)
+        """Let agents play, with a progress bar; a failure of one does not end the test."""
+        usual = self._probe.seconds * self._probe.usual_steps * count * len(evaluators)
         seconds = {name: self._seconds_of.get(name, usual) for name in agents}
         with self.progress(sum(seconds.values()), "test") as advance:
             return judge(
                 agents,
-                arenas,
+                evaluators,
                 count,
                 self._leave_out,
                 lambda name, part: advance(part * seconds[name]),
@@ -392,26 +397,26 @@ class Searching:
     def _leave_out(self, name: str, error: Exception) -> None:
         self.tell(f"left out: {name}: {reason(error)}")
 
-    def _planners(self, baseline: str | None, episodes: int) -> Iterator[Agent]:
+    def _planners(self, baseline: str | None, episodes: int) -> Iterator[ResidualAgent]:
         """The controllers that plan ahead and whose test takes no longer than the search.
 
         They begin with the plan of the baseline.
 
         Args:
             baseline: The text of a controller.
-            episodes: Those of the test. Its first steps tell how long a step takes.
+            episodes: Number of episodes of the test. Its first steps tell how long a step takes.
         """
         for name, text in self._probe.task.get("controllers", {}).items():
             if not plans_ahead(text):
                 continue
             try:
-                agent = Agent(name, warmed(text, baseline))
-                with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
-                    agent.play(arena, range(1))
+                agent = ResidualAgent(name, warmed(text, baseline))
+                with closing(CandidateEvaluator(self.make_env, most_steps=_TRIED)) as evaluator:
+                    agent.play(evaluator, range(1))
             except Exception as error:
                 self._leave_out(name, error)
                 continue
-            seconds = arena.seconds / arena.steps * self._probe.most_steps * episodes
+            seconds = evaluator.seconds / evaluator.steps * self._probe.most_steps * episodes
             if seconds <= 60.0 * (self.minutes or _MINUTES):
                 self._seconds_of[name] = seconds
                 yield agent

@@ -1,4 +1,4 @@
-"""Trainings in the logs of others: Weights & Biases, MLflow."""
+"""Trackers: logs of Weights & Biases and MLflow, to which trainings report."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ class Tracker(NamedTuple):
     close: Callable[[], None]
 
     def log(self, numbers: Mapping[str, Any], step: int) -> None:
-        """Log what is a number, of Python or of numpy."""
+        """Log the numbers among some values, of Python or of numpy."""
         kept = {n: float(v) for n, v in numbers.items() if isinstance(v, int | float | np.number)}
         self.take(kept, step)
 
 
 def tracker_for(kind: str, facts: Mapping[str, Any], folder: Path) -> Callable[[], Tracker]:
-    """Make a function that begins a run. Environment variables of the library tell where.
+    """Make a function that begins a run; environment variables of the library tell where.
 
     Args:
         kind: A key of ``TRACKERS``.
-        facts: What the run is: task, algorithm, arguments.
-        folder: That of the training, which is there when the run begins; its name is the run's.
+        facts: Facts about the run: task, algorithm, arguments.
+        folder: Folder of the training, which is there when the run begins; its name is the run's.
 
     Raises:
         ConfigError: If the library is missing.
@@ -65,4 +65,4 @@ TRACKERS: Final[Mapping[str, Callable[[Any, Mapping[str, Any], Path], Tracker]]]
     "mlflow": _of_mlflow,
     "wandb": _of_wandb,
 }
-"""The logs by name, which are those of their modules and extras."""
+"""Trackers by name, which is also the name of the module and the extra."""

@@ -32,7 +32,7 @@ from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.files import write_whole
 from fmugym.scaling import can_be_scaled
 from fmugym.training.agents import (
-    FACTS,
+    AGENT_FILE,
     agent_player,
     algorithm_of,
     imported_for_training,
@@ -47,9 +47,9 @@ from fmugym.training.checkpoints import (
     load_checkpoint,
     save_checkpoint,
 )
-from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, note
 from fmugym.training.residuals import begin_at_zero, residual_of
 from fmugym.training.tracking import Tracker
+from fmugym.training.training_records import EVALUATIONS, RECORDS, TrainingRecords, append_row
 from fmugym.vector import FMUVectorEnv
 
 __all__ = [
@@ -57,7 +57,7 @@ __all__ = [
     "TRIALS",
     "TrainingSettings",
     "Watch",
-    "arguments_of",
+    "algorithm_arguments",
     "facts_of",
     "require_new",
     "train",
@@ -71,23 +71,23 @@ _SECONDS_BETWEEN_CHECKPOINTS: Final = 30.0
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """What to train, and how.
+    """Settings of a training.
 
     Attributes:
         make_env: A function that makes the environment.
         held_out: By name, functions that make the environments of evaluations.
-        folder: Where the agent is written; it must not exist, unless a training is resumed.
+        folder: Folder of the new agent; it must not exist, unless a training is resumed.
         algorithm: The name of a class of Stable-Baselines3 or sb3-contrib.
         steps: Steps of all environments together, at most.
         num_envs: Environments that step together.
-        seed: Of the environments and of the algorithm.
+        seed: Seed of the environments and of the algorithm.
         episodes: Episodes of an evaluation in each environment of ``held_out``.
         most_steps: The steps after which an episode of an evaluation is stopped.
         normalize: Whether observations and rewards are normalized by running statistics. Actions
             with other ranges are scaled to -1 to 1 in any case.
         arguments: Arguments of the algorithm.
         residual: Which controller's action it adds to, see ``residual_facts``; None for none.
-        diary: What to record; None for nothing.
+        records: Settings of recordings; None for none.
     """
 
     make_env: Callable[..., FMUEnv]
@@ -102,10 +102,10 @@ class TrainingSettings:
     normalize: bool = True
     arguments: Mapping[str, Any] | None = None
     residual: Mapping[str, Any] | None = None
-    diary: Diary | None = None
+    records: TrainingRecords | None = None
 
     def facts(self) -> dict[str, Any]:
-        """What a training that is resumed must have in common with its beginning."""
+        """Facts that a resumed training must share with its beginning."""
         return {
             "algorithm": self.algorithm,
             "envs": self.num_envs,
@@ -122,7 +122,7 @@ class TrainingSettings:
         return self.make_env if self.residual is None else partial(self.make_env, physical=True)
 
 
-def arguments_of(texts: Iterable[str]) -> dict[str, Any]:
+def algorithm_arguments(texts: Iterable[str]) -> dict[str, Any]:
     """Read arguments of an algorithm, ``key=value`` with values as in TOML.
 
     A value that is none of TOML is taken as text: ``policy=MlpPolicy``.
@@ -144,7 +144,7 @@ def arguments_of(texts: Iterable[str]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Watch:
-    """Who is told of a training.
+    """Listener of a training.
 
     Attributes:
         tell: Gets a line of text for each evaluation.
@@ -169,11 +169,11 @@ def train(
     checkpoint from which the training can be resumed.
 
     Args:
-        settings: What to train.
+        settings: Settings of the training.
         resume: Whether to go on with the training in the folder. If the FMU's state can be saved or
             its steps repeated, all takes the same course as without the interruption, to the last
             bit.
-        watch: Who is told of the training.
+        watch: Listener of the training.
 
     Returns:
         The scores of the agent that is kept.
@@ -219,11 +219,11 @@ def _normalized(venv: Any) -> Any:
 
 
 def _recorder(settings: TrainingSettings, resume: bool) -> Callable[[FMUVectorEnv], Any]:
-    """What wraps the environments of a training."""
-    if settings.diary is None:
+    """Make the wrapper of a training's environments."""
+    if settings.records is None:
         return lambda envs: envs
     begin = latest_checkpoint(settings.folder)[1] if resume else 0
-    return settings.diary.of_training(settings.folder, begin)
+    return settings.records.of_training(settings.folder, begin)
 
 
 def _check_arguments(settings: TrainingSettings) -> None:
@@ -253,7 +253,7 @@ def require_new(folder: Path) -> None:
 
 
 def facts_of(folder: Path) -> dict[str, Any]:
-    """What a training was begun with.
+    """Facts with which a training was begun.
 
     Raises:
         ConfigError: If there is none.
@@ -286,7 +286,7 @@ def _new_model(settings: TrainingSettings, venv: Any) -> Any:
 
 
 def _with_fitting_rollouts(settings: TrainingSettings) -> dict[str, Any]:
-    """The arguments, with shorter rollouts where there are fewer steps than usual ones have."""
+    """Shorten rollouts for a training with fewer steps than a usual rollout."""
     own, most = dict(settings.arguments or {}), settings.steps // settings.num_envs
     default = inspect.signature(algorithm_of(settings.algorithm)).parameters.get("n_steps")
     if default is not None and 0 < most < default.default:
@@ -321,9 +321,9 @@ class _Training:
             self._tell_of_the_plan()
             settings.folder.mkdir(parents=True, exist_ok=True)
         facts: dict[str, Any] = {"schema": 1, "steps": settings.steps, **settings.facts()}
-        if settings.diary is not None:
+        if settings.records is not None:
             (settings.folder / RECORDS).mkdir(exist_ok=True)
-            facts["record"] = settings.diary.facts()
+            facts["record"] = settings.records.facts()
         write_whole(settings.folder / TRAINING, json.dumps(facts).encode())
         self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
         self._begin = self._told = self._steps
@@ -360,7 +360,9 @@ class _Training:
             else:
                 self.evaluate()
         except KeyboardInterrupt:
-            if not (self._settings.folder / FACTS).exists():  # a second one may end the evaluation
+            if not (
+                self._settings.folder / AGENT_FILE
+            ).exists():  # a second one may end the evaluation
                 self._keep()
             self.evaluate()
             raise
@@ -454,7 +456,7 @@ class _Training:
         self._watch.evaluated(steps, mean)
 
     def _player(self) -> Player:
-        """The one who acts as the agent does now."""
+        """Player of the agent as it is now."""
         if self._settings.residual is None:
             make_policy = partial(policy_with, self._model, self._normalization())
             return Player(make_policy, is_physical=False)
@@ -463,7 +465,7 @@ class _Training:
 
     def scores_of_kept(self) -> list[Score]:
         """Let the agent in the folder play the episodes of the evaluations once more."""
-        facts = json.loads((self._settings.folder / FACTS).read_text(encoding="utf-8"))
+        facts = json.loads((self._settings.folder / AGENT_FILE).read_text(encoding="utf-8"))
         self._watch.tell(f"the agent after {facts['steps']} steps was the best, and is kept")
         return self._scores(agent_player(self._settings.folder), lambda name: lambda env: env)
 
@@ -479,18 +481,18 @@ class _Training:
         ]
 
     def _wrap(self, name: str) -> Wrap:
-        """What wraps the environment of an evaluation."""
+        """Make the wrapper of an evaluation's environment."""
         settings = self._settings
-        if settings.diary is None:
+        if settings.records is None:
             return lambda env: env
-        return settings.diary.of_evaluation(settings.folder, self._steps, name)
+        return settings.records.of_evaluation(settings.folder, self._steps, name)
 
     def _normalization(self) -> Any:
         return self._venv if hasattr(self._venv, "normalize_obs") else None
 
     def _note(self, steps: int, mean: float, scores: list[Score]) -> None:
         names = ["steps", "reward", *(score.name for score in scores)]
-        note(self._settings.folder, names, [steps, mean, *(score.mean for score in scores)])
+        append_row(self._settings.folder, names, [steps, mean, *(score.mean for score in scores)])
         if self._tracker is not None:
             each = {f"evaluation/{score.name}": score.mean for score in scores}
             self._tracker.log({"evaluation/reward": mean, **each}, steps)
@@ -505,7 +507,7 @@ class _Training:
 
 
 def _writer_to(tracker: Tracker, base: Any) -> Any:
-    """What writes the log of Stable-Baselines3 to a tracker; it must be one of its own classes."""
+    """Make a writer from the log of Stable-Baselines3 to a tracker, of the library's own class."""
     methods = {
         "write": lambda self, values, excluded, step=0: tracker.log(values, step),
         "close": lambda self: None,

@@ -1,4 +1,4 @@
-"""A search on a surrogate of an FMU, whose result is proved on the FMU."""
+"""Search on a surrogate of an FMU, with its results proved on the FMU."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from time import monotonic
 from typing import Final, NamedTuple
 
-from fmugym.baselines.arena import Arena, Merit, Outcome
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, CandidateScores, Merit
 from fmugym.errors import ConfigError
 from fmugym.search.excitation import excite
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.search.search import VALIDATION, Search
 from fmugym.surrogate.courses import Courses
 from fmugym.surrogate.surrogate import Surrogate
@@ -24,7 +24,7 @@ _PROVED: Final = VALIDATION + 2000
 
 _TOLD: Final = VALIDATION + 3000
 _PREDICTED: Final = 32
-"""The first seed of those, and how many, that the surrogate plays for a prediction."""
+"""First seed and number of the episodes that the surrogate plays for a prediction."""
 
 _EXCITED: Final = 0.4
 """The part of all steps that excite the FMU,"""
@@ -33,11 +33,11 @@ _FEWEST: Final = 4
 """in at least so many episodes."""
 
 _FEWEST_PLAYED: Final = 6
-"""The steps have so many episodes at least: those that excite, one of the tuned controller and one
-of a policy."""
+"""Least number of episodes for the steps: the exciting ones, one of the tuned controller and one of
+a policy."""
 
 _DIVIDED: Final = 16
-"""Where they have more than so many, episodes are as long as those of the task."""
+"""From so many episodes on, they are as long as the task's."""
 
 _CYCLES: Final = 5
 _FIRST: Final = 300
@@ -45,28 +45,28 @@ _MORE: Final = 80
 """Rounds of the search until the first proof, and from one proof to the next."""
 
 _CLOSE: Final = 0.2
-"""A prediction is good enough if it is wrong by this part of what is gained."""
+"""Tolerated error of a prediction, as a part of the gain."""
 
 _MANY: Final = 256
 """So many surrogates step together."""
 
 
 class Proof(NamedTuple):
-    """What an agent has reached on the FMU.
+    """Result of an agent on the FMU.
 
     Attributes:
         agent: The agent.
-        seeds: Those of its episodes.
-        measured: What it has reached there.
+        seeds: Seeds of its episodes.
+        measured: Its result there.
     """
 
-    agent: Agent
+    agent: ResidualAgent
     seeds: Sequence[int]
-    measured: Outcome
+    measured: CandidateScores
 
 
 class Standing(NamedTuple):
-    """How good an agent is, and what the surrogate says of the episodes that it has played."""
+    """Estimate of an agent's merit, with the surrogate's predictions of its episodes."""
 
     merit: Merit
     predicted: float
@@ -83,8 +83,8 @@ class TwinSearch:
 
     Attributes:
         found: The search.
-        arena: The FMU's; its courses are kept.
-        courses: What the FMU has done.
+        evaluator: The FMU's; its courses are kept.
+        courses: Courses of the FMU.
         steps: How many steps of the FMU there may be.
         seconds: The real time that is left.
         rounds: The largest number of rounds.
@@ -94,7 +94,7 @@ class TwinSearch:
     """
 
     found: Search
-    arena: Arena
+    evaluator: CandidateEvaluator
     courses: Courses
     steps: float
     seconds: float
@@ -102,15 +102,15 @@ class TwinSearch:
     tell: Callable[[str], None]
     advance: Callable[[float, str], None]
     proofs: list[Proof] = field(default_factory=list)
-    best: Agent | None = None
+    best: ResidualAgent | None = None
 
     def __post_init__(self) -> None:
         self._end = monotonic() + self.seconds
-        most, left = self.found.probe.most_steps, self.steps - self.arena.steps
+        most, left = self.found.probe.most_steps, self.steps - self.evaluator.steps
         self.length = int(min(most, max(left // _DIVIDED, min(most / 2, left // _FEWEST_PLAYED))))
-        self.arena.most_steps = self.length
+        self.evaluator.most_steps = self.length
 
-    def winner(self) -> Agent:
+    def winner(self) -> ResidualAgent:
         """The best agent.
 
         Raises:
@@ -122,10 +122,10 @@ class TwinSearch:
                 "for a surrogate: give more --minutes or --steps"
             )
         count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
-        excite(self.arena, self.courses, self.found.probe, count, self.found.rng)
+        excite(self.evaluator, self.courses, self.found.probe, count, self.found.rng)
         for cycle in range(_CYCLES):
             surrogate = self._fitted()
-            with closing(self._arena_on(surrogate)) as twin:
+            with closing(self._evaluator_on(surrogate)) as twin:
                 if cycle:
                     self.found.revalidate(twin)
                 self._search(twin, cycle)
@@ -149,17 +149,19 @@ class TwinSearch:
     def _fitted(self) -> Surrogate:
         found = fit(self.courses)
         self.tell(
-            f"surrogate of {self.arena.steps} steps: {found.terms.form}; simulations are wrong by "
-            f"{100 * found.error:.2g} % of what outputs vary"
+            f"surrogate of {self.evaluator.steps} steps: {found.terms.form}; simulations are "
+            f"wrong by {100 * found.error:.2g} % of what outputs vary"
         )
         return found
 
-    def _arena_on(self, surrogate: Surrogate) -> Arena:
-        """Where the surrogate plays, whole episodes."""
+    def _evaluator_on(self, surrogate: Surrogate) -> CandidateEvaluator:
+        """Evaluator on the surrogate, of whole episodes."""
         probe = self.found.probe
-        return Arena(self.arena.make_env, _MANY, probe.most_steps, probe.limits, backend=surrogate)
+        return CandidateEvaluator(
+            self.evaluator.make_env, _MANY, probe.most_steps, probe.limits, backend=surrogate
+        )
 
-    def _search(self, twin: Arena, cycle: int) -> None:
+    def _search(self, twin: CandidateEvaluator, cycle: int) -> None:
         found, left = self.found, self._end - monotonic()
         until = monotonic() + left / 2
         last = min(self.rounds, found.rounds + (_MORE if cycle else _FIRST))
@@ -172,15 +174,15 @@ class TwinSearch:
 
     @property
     def _episodes(self) -> int:
-        """How many episodes of the FMU prove an agent."""
+        """Number of episodes of the FMU that prove an agent."""
         return (
             2 if self.length == self.found.probe.most_steps and not self.found.probe.is_same else 1
         )
 
     @property
     def _left(self) -> int:
-        """How many agents may be proved with the steps that are left."""
-        return int((self.steps - self.arena.steps) // (self.length * self._episodes))
+        """Number of agents that the rest of the steps can prove."""
+        return int((self.steps - self.evaluator.steps) // (self.length * self._episodes))
 
     def _prove(self) -> None:
         """Let the baseline and the best policies play on the FMU."""
@@ -194,13 +196,13 @@ class TwinSearch:
             agents.insert(0, base.best)
         for agent in agents[: self._left]:
             seeds = range(_PROVED, _PROVED + self._episodes)
-            self.proofs.append(Proof(agent, seeds, agent.play(self.arena, seeds)))
+            self.proofs.append(Proof(agent, seeds, agent.play(self.evaluator, seeds)))
 
-    def _values(self, twin: Arena) -> list[Standing]:
-        """How good the agents are that have played on the FMU."""
+    def _values(self, twin: CandidateEvaluator) -> list[Standing]:
+        """Merits of the agents that have played on the FMU."""
         return [self._value(one, twin) for one in self.proofs]
 
-    def _value(self, proof: Proof, twin: Arena) -> Standing:
+    def _value(self, proof: Proof, twin: CandidateEvaluator) -> Standing:
         most = twin.most_steps
         twin.most_steps = self.length
         same = proof.agent.play(twin, proof.seeds)
@@ -216,7 +218,7 @@ class TwinSearch:
         return Standing(corrected.merits[0], predicted, measured)
 
     def _tell_of(self, values: Sequence[Standing]) -> None:
-        """Tell what the surrogate has predicted, and what the FMU gives."""
+        """Report the predictions of the surrogate, and the results on the FMU."""
         for proof, value in zip(self.proofs, values, strict=True):
             self.tell(
                 f"{proof.agent.name}: predicted {value.predicted:.5g}, measured "
@@ -225,6 +227,6 @@ class TwinSearch:
 
 
 def _is_close(values: Sequence[Standing], best: int) -> bool:
-    """Whether the surrogate is close enough to what the FMU gives, beside what is gained."""
+    """Whether the errors of the surrogate are small compared with the gain."""
     wrong = abs(values[best].predicted - values[best].measured)
     return wrong <= _CLOSE * abs(values[best].merit[1] - values[0].merit[1])

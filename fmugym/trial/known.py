@@ -1,4 +1,4 @@
-"""What an FMU is known by, and what earlier trials have shown, kept in the cache folder.
+"""Results of earlier trials, kept in the cache folder under the identity of the FMU.
 
 If the folder cannot be read or written, nothing is kept, and no error is raised.
 """

@@ -1,4 +1,4 @@
-"""How a pool is opened, and why: the caller's wishes, completed with the results of a trial."""
+"""Plan of opening a pool: the caller's wishes, completed with the results of a trial."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from fmugym.trial.workers import TriedPool
 
 __all__ = [
     "Halfway",
-    "Played",
+    "PairResult",
     "Watched",
     "is_repeated",
     "play_again_and_again",
@@ -288,36 +288,36 @@ _FEW_ROUNDS: Final = 2
 
 
 @dataclass(frozen=True)
-class Played:
+class PairResult:
     """What two instances gave in an episode, and how many initializations it took."""
 
     runs: tuple[Run, ...]
     initializations: int
 
     @classmethod
-    def by(cls, pool: TriedPool, reference: Reference) -> Played:
+    def by(cls, pool: TriedPool, reference: Reference) -> PairResult:
         """Play an episode of two instances with long calls; see ``spec_with_long_calls``."""
         before, inputs = pool.initializations, Inputs(pool.spec, reference.inputs.amplitude)
         runs = play(pool, reference.starts, inputs, [Stretch((0, 1), _CALLS)])
         return cls(tuple(own[0] for own in runs), pool.initializations - before)
 
-    def allows(self, other: Played) -> bool:
+    def allows(self, other: PairResult) -> bool:
         """Whether another episode is as this one; a pool may repeat a failed initialization."""
         same = all(one.equals(two) for one, two in zip(self.runs, other.runs, strict=True))
         return same and other.initializations <= self.initializations
 
 
-def play_rounds(pool: TriedPool, reference: Reference) -> list[Played]:
+def play_rounds(pool: TriedPool, reference: Reference) -> list[PairResult]:
     """Play what rounds in threads are compared with: a first and a later episode.
 
     Args:
         pool: Two instances, stepped by one thread.
         reference: Has the start values, and how far inputs move.
     """
-    return [Played.by(pool, reference) for _ in range(2)]
+    return [PairResult.by(pool, reference) for _ in range(2)]
 
 
-def is_repeated(pool: TriedPool, reference: Reference, expected: Sequence[Played]) -> bool:
+def is_repeated(pool: TriedPool, reference: Reference, expected: Sequence[PairResult]) -> bool:
     """Whether two instances give the same again and again.
 
     Args:
@@ -326,7 +326,7 @@ def is_repeated(pool: TriedPool, reference: Reference, expected: Sequence[Played
         expected: What they give in one thread, first and later.
     """
     return all(
-        expected[min(number, len(expected) - 1)].allows(Played.by(pool, reference))
+        expected[min(number, len(expected) - 1)].allows(PairResult.by(pool, reference))
         for number in _rounds()
     )
 

@@ -49,7 +49,7 @@ from fmugym.trial.known import (
     with_harm,
 )
 from fmugym.trial.reference import AMPLITUDES, Reference
-from fmugym.trial.steps import Halfway, Played
+from fmugym.trial.steps import Halfway, PairResult
 from fmugym.trial.trial_episodes import Inputs, Run, Starts, Stretch, play
 from fmugym.trial.verdict import MOST_INSTANCES, Finding, Grade, Neighbours, Verdict
 from fmugym.trial.workers import CLOSING, STEP, DeathError, Workers
@@ -551,14 +551,16 @@ class _Trial:
         reference, stage = self._reference, "the comparison of instances in two threads"
         open_pool = partial(self.workers.pool, stage, spec, 2, private_libraries=private_libraries)
 
-        def alone() -> list[Played]:
+        def alone() -> list[PairResult]:
             with open_pool() as pool:
                 return steps.play_rounds(pool, reference)
 
         def compare() -> Finding:
             with open_pool(threads=2) as pool:
                 same = steps.is_repeated(pool, reference, expected)
-            if same or not all(map(Played.allows, expected, alone())):  # or they never repeat it
+            if same or not all(
+                map(PairResult.allows, expected, alone())
+            ):  # or they never repeat it
                 return Finding(Grade.BITWISE, "")
             return Finding(Grade.WRONG, "some outputs differ")
 

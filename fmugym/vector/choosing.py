@@ -1,4 +1,4 @@
-"""How the hooks of N environments are called: in programs, on arrays, or one by one."""
+"""Choice of the engine that calls the hooks of N environments: programs, arrays, or one by one."""
 
 from __future__ import annotations
 

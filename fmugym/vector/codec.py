@@ -20,7 +20,7 @@ import numpy.typing as npt
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
 
-__all__ = ["coded", "gathered", "handed_out", "mapped", "with_masks", "within"]
+__all__ = ["coded", "gathered", "handed_out", "mapped", "masked", "with_masks"]
 
 
 def mapped(function: Callable[..., Any], *trees: Any) -> Any:
@@ -33,7 +33,7 @@ def mapped(function: Callable[..., Any], *trees: Any) -> Any:
     return function(*trees)
 
 
-def within(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+def masked(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Copy values of environments, but zero (or None) outside of a mask."""
     result = np.zeros_like(values) if values.dtype != object else np.full_like(values, None)
     result[mask] = values[mask]
@@ -51,7 +51,7 @@ def with_masks(values: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
 
 def coded(rows: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
     """Make infos of the environments in a mask from arrays of all environments."""
-    return with_masks(mapped(partial(within, mask), rows), mask)
+    return with_masks(mapped(partial(masked, mask), rows), mask)
 
 
 def gathered(infos: Mapping[int, Mapping[str, Any]], count: int) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import environments_first
 from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.values import UNFILLED, LateDict
-from fmugym.vector.codec import coded, mapped, within
+from fmugym.vector.codec import coded, mapped, masked
 
 __all__ = [
     "copy_rows",
@@ -25,9 +25,9 @@ __all__ = [
     "last_observations",
     "late_info",
     "merged",
-    "not_finite",
     "observation_of",
     "restricted",
+    "rows_not_finite",
 ]
 
 
@@ -78,7 +78,7 @@ def restricted(infos: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
         if own is None or not (own & mask).any():  # it is a mask itself, or of others
             continue
         is_dict = isinstance(values, Mapping)
-        result[name] = restricted(values, mask) if is_dict else within(own & mask, values)
+        result[name] = restricted(values, mask) if is_dict else masked(own & mask, values)
         result[f"_{name}"] = own & mask
     return result
 
@@ -109,10 +109,10 @@ def copy_rows(source: Any, target: Any, mask: MaskArray) -> None:
     mapped(copy, target, source)
 
 
-def not_finite(values: Any) -> MaskArray | None:
+def rows_not_finite(values: Any) -> MaskArray | None:
     """Which rows of an array, or of a dict of arrays, hold NaN or infinity; None for no row."""
     if type(values) is dict:
-        found = [rows for rows in map(not_finite, values.values()) if rows is not None]
+        found = [rows for rows in map(rows_not_finite, values.values()) if rows is not None]
         return np.logical_or.reduce(found) if found else None
     if values.dtype.kind != "f":
         return None

@@ -16,7 +16,7 @@ from fmugym.task.native_draws import no_draws
 from fmugym.task.saving import READ
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
-from fmugym.vector.hooks.memory import Memory
+from fmugym.vector.hooks.memory import StepArrays
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.views import EpisodeColumn, batched
 
@@ -63,7 +63,7 @@ class ExpressionStep:
         if task.inputs.loads("parameter") or task.judgement.loads("parameter"):
             numbers = zip(draws.parameter_names, starts, strict=True)
             rows.parameters = {name: row for name, row in numbers if name not in draws.strings}
-        self._memory = memory = Memory(env, rows, np.zeros(1, np.bool_))
+        self._memory = memory = StepArrays(env, rows, np.zeros(1, np.bool_))
         memory.hold(task)
         shapes, form, self._divided = Layout(task, env, 1).of_one()
         play = memory.prepare(

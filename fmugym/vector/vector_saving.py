@@ -1,4 +1,4 @@
-"""What makes the episodes of a batch of environments, as columns of a snapshot."""
+"""Episodes of a batch of environments as columns of a snapshot."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from fmugym.task.snapshot import Columns, Snapshot
 
 __all__ = [
     "Which",
+    "batch_columns",
     "chosen",
-    "columns_of",
+    "place_batch",
     "place_column",
-    "place_columns",
     "require_fit",
     "sources_for",
     "which_of",
@@ -84,7 +84,7 @@ def which_of(indices: IndexArray, count: int) -> Which:
     return slice(None) if in_order else indices
 
 
-def columns_of(env: FMUEnv, which: Which) -> Columns:
+def batch_columns(env: FMUEnv, which: Which) -> Columns:
     """Copy what hooks read in some environments of a batch, whose prototype this is."""
     require_quantities(env)
     columns = read_columns(env, partial(_rows, which))
@@ -97,7 +97,7 @@ def _rows(which: Which, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return rows
 
 
-def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
+def place_batch(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
     for name in READ:
         place_column(getattr(env._episode, name), columns[name], sources, which)

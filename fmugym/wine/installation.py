@@ -1,4 +1,4 @@
-"""Finds Wine on this machine, and translates paths."""
+"""Finder of Wine on this machine, and translation of paths."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 _NAMES: Final = ("wine64", "wine")
 _PLACES: Final = ("/usr/lib/wine/wine64", "/opt/wine-stable/bin/wine64", "/opt/wine-devel/bin/wine")
-"""Where packages put the loader outside of the search path; the first is Debian's."""
+"""Folders of packages with the loader, outside of the search path; the first is Debian's."""
 
 _HOW_TO_GET_WINE: Final = (
     "install Wine (on Debian and Ubuntu: apt install wine64; on Fedora: dnf install wine-core), or "
@@ -57,7 +57,7 @@ def find_wine() -> Path | None:
 
 
 def obstacle_to_wine() -> str:
-    """Say what is missing here before a Windows library can run; "" if nothing is."""
+    """Name the missing condition for Windows libraries; "" if there is none."""
     missing = [] if find_wine() is not None else [_HOW_TO_GET_WINE]
     if known_program() is None and not is_buildable():
         missing.append(_HOW_TO_GET_ZIG)

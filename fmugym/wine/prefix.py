@@ -1,4 +1,4 @@
-"""Wine's own folder with its registry and system libraries: the prefix.
+"""Wine's prefix: a folder with its registry and system libraries.
 
 Each version of Wine gets one of this package's own, which is made once. Nothing in it opens a
 window, asks the network, or runs in the background.
@@ -40,14 +40,14 @@ _LIBRARIES: Final = (
     "usr/lib/*/wine/x86_64-windows/*.*",
     "opt/wine-*/lib*/wine/x86_64-windows/*.*",
 )
-"""Where packages put Wine's own libraries."""
+"""Folders of packages with Wine's own libraries."""
 
 _LONGEST_MAKING: Final = 600.0
 """Seconds; making a prefix takes some 15 s."""
 
 
 class Wine(NamedTuple):
-    """What a worker in Wine needs.
+    """Paths and environment of a worker in Wine.
 
     Attributes:
         loader: Wine's own program.
@@ -77,12 +77,12 @@ class Wine(NamedTuple):
         return [str(self.loader), str(self.program)]
 
     def environment(self, outside: Mapping[str, str]) -> dict[str, str]:
-        """The environment variables of a worker, made of those of a process outside of Wine."""
+        """Environment variables of a worker, from the variables of a process outside of Wine."""
         return _environment(self.prefix, outside, _OFF_IN_WORKERS)
 
 
 def _environment(prefix: Path, outside: Mapping[str, str], off: str) -> dict[str, str]:
-    """Leave out displays and what Wine must not load; the user's own choices of Wine count."""
+    """Leave out displays, and libraries that Wine must not load; the user's choices count."""
     own = {name: value for name, value in outside.items() if name not in _DISPLAYS}
     overrides = ";".join(filter(None, (off, own.get("WINEDLLOVERRIDES", ""))))
     own.setdefault("WINEDEBUG", "-all")

@@ -1,4 +1,4 @@
-"""The worker program for Windows, which is built from the sources of the C extension.
+"""Worker program for Windows, built from the sources of the C extension.
 
 ``ziglang`` from PyPI compiles it where it is first needed. The program is kept in the cache folder,
 under a name that stands for its sources and its compiler.
@@ -37,7 +37,7 @@ _OPTIONS: Final = (
     *("-target", "x86_64-windows-gnu", "-std=gnu11", "-O2", "-g0", "-s"),
     *("-ffp-contract=off", "-fno-math-errno"),
 )
-"""The arithmetic is that of the extension; see ``setup.py``."""
+"""Options of the compiler; the arithmetic is that of the extension, see ``setup.py``."""
 
 _LONGEST_BUILD: Final = 900.0
 """Seconds; ziglang's first build for Windows takes some two minutes, later ones ten seconds."""
@@ -98,7 +98,7 @@ def is_buildable() -> bool:
 
 
 def known_program() -> Path | None:
-    """Find the program if it was built before; without a compiler, that of any version counts."""
+    """Find a program that was built before; without a compiler, any version counts."""
     with contextlib.suppress(FMULoadError):
         found = sorted(wine_folder().glob(f"worker-{_digest()}-{_compiler_version() or '*'}.exe"))
         return found[-1] if found else None

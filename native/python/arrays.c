@@ -1,3 +1,5 @@
+/* Arrays of numpy, which are used again as soon as nobody else holds them. */
+
 #include "arrays.h"
 
 #include <math.h>

@@ -1,3 +1,5 @@
+/* Checks of the arrays of a caller: type, shape and alignment. */
+
 #include "buffers.h"
 
 #include <stdint.h>

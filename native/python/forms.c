@@ -1,3 +1,5 @@
+/* The form of observations or infos: an array, or a dict of forms by name. */
+
 #include "forms.h"
 
 #include <stdlib.h>

@@ -1,3 +1,5 @@
+/* Infos of environments in Gymnasium's form, with their masks. */
+
 #include "infos.h"
 
 #include <string.h>

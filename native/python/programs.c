@@ -1,3 +1,5 @@
+/* Programs, taken over from Python. */
+
 #include "programs.h"
 
 #include <stdlib.h>

@@ -1,3 +1,5 @@
+/* The results of a step or a reset: arrays, tuples and dicts. */
+
 #include "results.h"
 
 #include <stdlib.h>

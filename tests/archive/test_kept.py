@@ -12,7 +12,7 @@ from fmu_tools import probe_fmu
 
 from fmugym import FMU, FMULoadError, bundled_fmu
 from fmugym.archive import ArchiveLimits, kept, reading
-from fmugym.archive.bundled import BUNDLED
+from fmugym.archive.bundled import BUNDLED_FMUS
 
 MANY = 2000
 PLAIN = (
@@ -107,7 +107,7 @@ def test_each_interface_is_kept_by_itself(cache, tmp_path, monkeypatch, unread, 
 
 def every_kind(folder):
     yield from (probe_fmu(folder / f"probe {version}", version) for version in (1, 2, 3))
-    yield from (bundled_fmu(model, version) for model, version in BUNDLED)
+    yield from (bundled_fmu(model, version) for model, version in BUNDLED_FMUS)
     for version in (1, 2, 3):
         yield exchange_fmu(folder / f"{version}.fmu", "friction", version)
     yield clocks_fmu(folder / "clocks.fmu", arrays=True)

@@ -18,7 +18,7 @@ from fmu_tools import (
 
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
 from fmugym.archive import ArchiveLimits
-from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS
 
 
 def describe(path):
@@ -30,7 +30,7 @@ def with_xml(tmp_path, xml):
 
 
 class TestBundledModels:
-    @pytest.mark.parametrize(("model", "version"), BUNDLED)
+    @pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
     def test_variables_are_those_that_fmpy_reads(self, model, version):
         path = bundled_fmu(model, version)
         ours, theirs = describe(path), fmpy.read_model_description(str(path))

@@ -10,7 +10,7 @@ from system_tools import system
 import fmugym
 from fmugym import FMU, ConfigError, bundled_fmu
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import Component
+from fmugym.systems.system_plan import ComponentPlan
 
 TWICE = {"sum": 14, "mix": 13, "a": 3, "gain": 23, "trim": 12, "x[2]": 11}
 """Names, and other value references behind them."""
@@ -119,7 +119,10 @@ def test_a_name_that_a_task_uses(tmp_path, key, value):
 
 
 def test_of_a_component(tmp_path):
-    parts = Component("plant", twin_fmu(tmp_path, 2)), Component("other", bundled_fmu("Pendulum"))
+    parts = (
+        ComponentPlan("plant", twin_fmu(tmp_path, 2)),
+        ComponentPlan("other", bundled_fmu("Pendulum")),
+    )
     about = SystemFMU(system(parts, ())).description
     assert about.variable("plant.b").causality == "input"
     with pytest.raises(ConfigError, match=r"'plant\.sum' is the name of 2 variables"):

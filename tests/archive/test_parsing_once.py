@@ -5,7 +5,7 @@ from fmu_tools import MAJOR_VERSIONS, probe_fmu, require_refused
 
 from fmugym import FMU, FMULoadError, bundled_fmu
 from fmugym.archive import reading
-from fmugym.archive.bundled import BUNDLED
+from fmugym.archive.bundled import BUNDLED_FMUS
 
 FLAG = {"<Real ": '<Real relativeQuantity="true" '}
 BEGIN, END = "<ModelVariables>", "</ModelVariables>"
@@ -54,7 +54,7 @@ def test_those_with_more_are_parsed(parsed, tmp_path, version, edits):
     assert '"mix"' in parsed[0]
 
 
-@pytest.mark.parametrize(("model", "version"), BUNDLED)
+@pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
 def test_bundled_models_are_read_alike(model, version, monkeypatch):
     require_the_same(bundled_fmu(model, version), monkeypatch)
 

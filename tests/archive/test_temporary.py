@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from fmugym import FMU, FMULoadError
 from fmugym.archive import temporary
-from fmugym.archive.temporary import folder_name, is_plain
+from fmugym.archive.temporary import folder_name, is_plain_path
 
 each_root = pytest.mark.parametrize(
     "name", ["a b", "Müller", "a%20b", "a+b", "a#b", "x" * 200, "it's", "a(1)"]
@@ -66,7 +66,7 @@ def test_the_folder_goes(tmp_path, use, name):
     use(name)
     fmu = FMU(resource_fmu(tmp_path, 2))
     folder = fmu.extract()
-    assert is_plain(folder)
+    assert is_plain_path(folder)
     assert (folder.stat().st_mode & 0o077) == 0
     fmu.close()
     assert not folder.exists()

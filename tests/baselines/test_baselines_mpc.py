@@ -14,7 +14,7 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.baselines import MPC, PID, controller_of
 from fmugym.baselines.mpc import _Foresight
-from fmugym.baselines.observer import spread
+from fmugym.baselines.observer import parameters_of_copies
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.fmi.status import WARNING_CODE
@@ -303,7 +303,7 @@ class TestModel:
         rows = np.stack([mass, 2.0 - mass], axis=1)
         np.savez(tmp_path / "rows.npz", names=np.array(["m", "l"]), rows=rows)
         env = env_of(wheel() | {"fitted": str(tmp_path / "rows.npz")})
-        values = spread(env, 0)
+        values = parameters_of_copies(env, 0)
         np.testing.assert_allclose(values["m"] + values["l"], 2.0)
         assert abs(values["m"][0] - np.median(mass)) < 0.05
         assert np.ptp(values["m"]) > 0.5

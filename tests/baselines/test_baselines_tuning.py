@@ -7,8 +7,8 @@ import pytest
 
 import fmugym
 from fmugym.baselines import PID, Constant, Controller, Hysteresis, tune
-from fmugym.baselines.arena import Outcome
-from fmugym.baselines.tuning import entrant_of
+from fmugym.baselines.candidate_evaluation import CandidateScores
+from fmugym.baselines.tuning import candidate_search_of
 from fmugym.envs import HouseEnv
 from fmugym.linearization import linearize
 from fmugym.vector import FMUVectorEnv
@@ -193,21 +193,23 @@ class TestMistakes:
 
 
 class Deceptive:
-    """Stands for an arena: a wide hill with its top in the middle, and a narrow higher one."""
+    """Stands for an evaluator: a wide hill with its top in the middle, and a narrow higher one."""
 
     def play(self, make, places, seeds, has_moments=False):
         wide, narrow = (np.linalg.norm(places - top, axis=1) for top in (0.5, 0.85))
         returns = np.maximum(0.5 - wide, 1.0 - 3.0 * narrow)[:, None]
         nothing = np.zeros((*returns.shape, 1))
-        return Outcome(returns, nothing, {}, nothing)
+        return CandidateScores(returns, nothing, {}, nothing)
 
 
 def test_it_looks_everywhere_at_first():
     ranges = dict.fromkeys("ab", fmugym.Uniform(0, 1))
     found = []
     for seed in range(20):
-        entrant = entrant_of(None, ranges, (32, 8), 1, np.random.default_rng(seed))
+        candidate_search = candidate_search_of(
+            None, ranges, (32, 8), 1, np.random.default_rng(seed)
+        )
         for _ in range(20):
-            entrant.play(Deceptive(), [0])
-        found.append(entrant.lead[1] > 0.8)
+            candidate_search.play(Deceptive(), [0])
+        found.append(candidate_search.lead[1] > 0.8)
     assert sum(found) >= 17

@@ -22,7 +22,7 @@ from pythonfmu.builder import FmuBuilder
 
 import fmugym
 from fmugym.archive.bundled import FMI_VERSIONS
-from fmugym.tools.cli import _parser, main
+from fmugym.tools.cli import _parser, run_command_line
 from fmugym.tools.options import EXAMPLES, speaking
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
@@ -82,7 +82,7 @@ def facts(info):
 @pytest.fixture
 def skeleton(capsys):
     def call(path):
-        assert main(["new", "--class", str(path)]) == 0
+        assert run_command_line(["new", "--class", str(path)]) == 0
         return capsys.readouterr()
 
     return call
@@ -412,7 +412,12 @@ class TestNew:
 
 def assert_skeleton_runs(fmu, folder, *options):
     """Write a skeleton into a folder and run it."""
-    assert main(["new", "--class", str(fmu), "--output", str(folder / "made.py"), "--force"]) == 0
+    assert (
+        run_command_line(
+            ["new", "--class", str(fmu), "--output", str(folder / "made.py"), "--force"]
+        )
+        == 0
+    )
     done = run_python(*options, "made.py", cwd=folder, timeout=300)
     assert done.returncode == 0, done.stderr
     assert "keeps the contract" in done.stdout
@@ -443,14 +448,14 @@ class TestCommand:
     @pytest.mark.parametrize("arguments", [[], ["info"], ["inof", "x.fmu"], ["info", "x", "-y"]])
     def test_wrong_arguments_exit_with_2(self, arguments, capsys):
         with pytest.raises(SystemExit) as caught:
-            main(arguments)
+            run_command_line(arguments)
         assert caught.value.code == 2
         assert "error" in capsys.readouterr().err
 
     @pytest.mark.parametrize("name", EXAMPLES)
     def test_help_has_examples_that_the_documents_run(self, name, capsys):
         with pytest.raises(SystemExit):
-            main([name, "--help"])
+            run_command_line([name, "--help"])
         said = capsys.readouterr().out
         pages = " ".join(page.read_text() for page in (HERE.parent / "docs").glob("*.md"))
         documents = " ".join(pages.replace("\\\n", " ").split())
@@ -545,7 +550,7 @@ class TestCommand:
 
     def test_version(self, capsys):
         with pytest.raises(SystemExit) as caught:
-            main(["--version"])
+            run_command_line(["--version"])
         assert caught.value.code == 0
         assert capsys.readouterr().out.strip()[0].isdigit()
 
@@ -568,7 +573,8 @@ class TestCommand:
             ["info", str(path), "--json"],
             ["new", "--class", str(path)],
         ]
-        program = f"from fmugym.tools.cli import main\nassert not any(map(main, {commands}))"
+        program = "from fmugym.tools.cli import run_command_line as run"
+        program = f"{program}\nassert not any(map(run, {commands}))"
         done = run_python("-c", program, environment={"PYTHONIOENCODING": "ascii:strict"})
         assert done.returncode == 0, done.stderr
         assert r"25 \xb0C" in done.stdout

@@ -11,7 +11,7 @@ import ssp_tools
 from source_tools import write_source_fmu
 
 import fmugym
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "command-line.md").read_text()
@@ -45,14 +45,14 @@ def test_examples_of_commands_run(block, tmp_path, monkeypatch, capsys):
     if "system.ssp" in block:
         write_system("system.ssp")
     if "fmugym new" not in block:
-        assert main(["new", "model.fmu", "--output", "task.toml"]) == 0
+        assert run_command_line(["new", "model.fmu", "--output", "task.toml"]) == 0
     for command in commands(block):
         for text, module in NEEDS.items():
             if text in command and not find_spec(module):
                 pytest.skip(f"needs {module}, which an extra of the package brings")
         program, *arguments = shlex.split(command)
         assert program == "fmugym"
-        assert main(shortened(arguments)) == 0, capsys.readouterr().err
+        assert run_command_line(shortened(arguments)) == 0, capsys.readouterr().err
     capsys.readouterr()
 
 
@@ -74,7 +74,7 @@ def write_system(path):
 def test_every_command_has_an_example_or_a_link():
     shown = {shlex.split(command)[1] for block in BLOCKS for command in commands(block)}
     with pytest.raises(SystemExit):
-        main(["--help"])
+        run_command_line(["--help"])
     listed = set(re.findall(r"^\| \[?`([\w-]+)`", PAGE, re.M)) & known_commands()
     assert listed == known_commands()
     assert known_commands() - shown == {"serve"}  # on pages of their own

@@ -10,9 +10,9 @@ import pytest
 
 import fmugym
 from fmugym.baselines import MPC
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.baselines.table_texts import table_in
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.tools import watching
 from fmugym.training import searching
 from fmugym.training.comparing import judge, verdict
@@ -107,15 +107,15 @@ class TestTrain:
     def test_the_folder_comes_although_the_agent_itself_fails(
         self, error, written, tmp_path, cli, monkeypatch
     ):
-        def play(agent, arena, seeds):
+        def play(agent, evaluator, seeds):
             if not agent.acting:
-                return real(agent, arena, seeds)
+                return real(agent, evaluator, seeds)
             raise error("it has failed")
 
-        real, judged = Agent.play, searching.judge
+        real, judged = ResidualAgent.play, searching.judge
 
         def judge(*arguments):
-            monkeypatch.setattr(Agent, "play", play)
+            monkeypatch.setattr(ResidualAgent, "play", play)
             return judged(*arguments)
 
         monkeypatch.setattr(searching, "judge", judge)
@@ -135,11 +135,11 @@ class TestTrain:
             raise fmugym.ConfigError("there is no weather")
 
         make = lambda: fmugym.load(fmugym.Task.from_dict(ONE))  # noqa: E731
-        agents = {name: Agent(name, f"schedule 00:00={name}") for name in ("0.05", "0")}
+        agents = {name: ResidualAgent(name, f"schedule 00:00={name}") for name in ("0.05", "0")}
         told, parts = [], []
         found = judge(
             agents,
-            {"frost": Arena(fails), "spring": Arena(make)},
+            {"frost": CandidateEvaluator(fails), "spring": CandidateEvaluator(make)},
             2,
             lambda name, error: told.append((name, str(error))),
             lambda name, part: parts.append((name, part)),
@@ -254,8 +254,12 @@ class TestProgress:
 def test_groups_are_parts_of_a_whole():
     """Ten episodes of three candidates in four environments."""
     parts = []
-    arena = Arena(lambda: fmugym.load(fmugym.Task.from_dict(ONE)), 4, advance=parts.append)
+    evaluator = CandidateEvaluator(
+        lambda: fmugym.load(fmugym.Task.from_dict(ONE)), 4, advance=parts.append
+    )
     numbers = np.zeros((3, 1))
-    arena.play(lambda rows: Agent("0", "schedule 00:00=0")(rows[:, :0]), numbers, range(10))
-    arena.close()
+    evaluator.play(
+        lambda rows: ResidualAgent("0", "schedule 00:00=0")(rows[:, :0]), numbers, range(10)
+    )
+    evaluator.close()
     assert sum(parts) == pytest.approx(1.0)

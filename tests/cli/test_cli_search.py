@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines.arena import Arena
-from fmugym.search.policy import AGENT, Agent
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
+from fmugym.search.policy import POLICY_FILE, ResidualAgent
 from fmugym.search.search import Search
 from fmugym.series.intervals import confidence
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 from fmugym.training.comparing import verdict
 from fmugym.training.searching import Searching
 
@@ -110,29 +110,29 @@ def curve(folder):
 
 
 def content(folder):
-    return (folder / AGENT).read_bytes()
+    return (folder / POLICY_FILE).read_bytes()
 
 
 class Interruption:
     """Ctrl-C after some rounds, or within the next one."""
 
     def __init__(self, monkeypatch, rounds, *, within=False):
-        self.rounds, self.now, advance, play = rounds, -1, Search.advance, Arena.play
+        self.rounds, self.now, advance, play = rounds, -1, Search.advance, CandidateEvaluator.play
 
-        def advanced(search, arena):
+        def advanced(search, evaluator):
             if not within and search.rounds >= self.rounds:
                 raise KeyboardInterrupt
             self.now = search.rounds
-            advance(search, arena)
+            advance(search, evaluator)
 
-        def played(arena, *arguments, **options):
-            outcome = play(arena, *arguments, **options)
+        def played(evaluator, *arguments, **options):
+            outcome = play(evaluator, *arguments, **options)
             if within and self.now >= self.rounds:
                 raise KeyboardInterrupt
             return outcome
 
         monkeypatch.setattr(Search, "advance", advanced)
-        monkeypatch.setattr(Arena, "play", played)
+        monkeypatch.setattr(CandidateEvaluator, "play", played)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def whole(tmp_path_factory):
     path, out = tmp_path_factory.mktemp("search"), io.StringIO()
     options = "--output", str(path / "whole"), *SMALL, "--rounds", str(ROUNDS)
     with redirect_stdout(out), redirect_stderr(io.StringIO()):
-        assert main(["train", str(written(path)), *options]) == 0
+        assert run_command_line(["train", str(written(path)), *options]) == 0
     return path / "whole", out.getvalue()
 
 
@@ -201,7 +201,7 @@ class TestCourse:
             code, out, err = searched(task, parts, "--rounds", ROUNDS)
         assert (code, out) == (130, "")
         assert "--resume" in err
-        assert Agent.load(parts).name == facts_of(parts)["agent"]  # the best until then
+        assert ResidualAgent.load(parts).name == facts_of(parts)["agent"]  # the best until then
         options = "--output", parts, "--episodes", "3", "--rounds", ROUNDS, "--resume"
         code, out, err = cli("train", task, *options)
         assert (code, out) == (0, whole[1]), err

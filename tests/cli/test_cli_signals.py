@@ -15,10 +15,10 @@ from process_tools import faulty_fmu, start_values
 
 import fmugym
 from fmugym import __main__ as program
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.search.probe import Probe
 from fmugym.search.search import Search
-from fmugym.tools import ending
+from fmugym.tools import signal_handling
 from fmugym.training import outcome, searching
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -26,8 +26,8 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSI
 CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
 HANGING = """
 import sys
-from fmugym.tools import ending
-ending._TIMEOUT = 0.5
+from fmugym.tools import signal_handling
+signal_handling._TIMEOUT = 0.5
 from fmugym.__main__ import main
 sys.exit(main())
 """
@@ -134,8 +134,8 @@ MOMENTS = {
 @pytest.fixture(params=[signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def number(request, monkeypatch):
     """A signal that ends commands."""
-    monkeypatch.setattr(ending, "_begun", threading.Event())
-    before = signal.signal(request.param, ending._raise)
+    monkeypatch.setattr(signal_handling, "_begun", threading.Event())
+    before = signal.signal(request.param, signal_handling._raise)
     yield request.param
     signal.signal(request.param, before)
 
@@ -175,8 +175,8 @@ def test_an_error_in_a_clean_up_does_not_hide_the_signal(number, tmp_path, cli, 
     def fails(*arguments):
         raise OSError(39, "Directory not empty")
 
-    def signalled(search, arena):
-        monkeypatch.setattr(Arena, "close", fails)
+    def signalled(search, evaluator):
+        monkeypatch.setattr(CandidateEvaluator, "close", fails)
         os.kill(os.getpid(), number)
 
     monkeypatch.setattr(Search, "advance", signalled)
@@ -191,8 +191,8 @@ def test_while_modules_are_loaded(monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(program, "end_as_after_ctrl_c", signalled)
-    monkeypatch.setattr(ending, "_begun", threading.Event())
-    before = signal.signal(signal.SIGTERM, ending._raise)
+    monkeypatch.setattr(signal_handling, "_begun", threading.Event())
+    before = signal.signal(signal.SIGTERM, signal_handling._raise)
     try:
         assert program.main() == 143
     finally:

@@ -18,7 +18,7 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.episodes.evaluation import HELD_OUT_SEED, evaluate, warning_of_one_reward
 from fmugym.episodes.simulation import Player, action_of
-from fmugym.training.training import TrainingSettings, arguments_of, train
+from fmugym.training.training import TrainingSettings, algorithm_arguments, train
 
 CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
 SCENARIOS = {
@@ -121,7 +121,7 @@ class TestEvaluate:
 
 def test_arguments_of_an_algorithm():
     texts = ["gamma=0.9", "n_steps=64", "policy=MlpPolicy", "policy_kwargs={net_arch=[8]}", "a=b=c"]
-    assert arguments_of(texts) == {
+    assert algorithm_arguments(texts) == {
         "gamma": 0.9,
         "n_steps": 64,
         "policy": "MlpPolicy",
@@ -129,7 +129,7 @@ def test_arguments_of_an_algorithm():
         "a": "b=c",
     }
     with pytest.raises(ConfigError, match="'gamma'"):
-        arguments_of(["gamma"])
+        algorithm_arguments(["gamma"])
 
 
 def test_without_sb3_training_names_the_extra(tmp_path, trained, monkeypatch):

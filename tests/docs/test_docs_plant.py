@@ -17,7 +17,7 @@ pytest.importorskip("scipy", reason="needs SciPy, of the extra identification")
 pytest.importorskip("matplotlib", reason="needs Matplotlib, of the extra plot")
 
 from fmugym.logs import PlantLog
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 
 TEXT = (Path(__file__).parents[2] / "docs" / "plant-tutorial.md").read_text(encoding="utf-8")
 REACHED = re.compile(r"seed \d+: reward (\S+), cost \S+ in (\d+) steps")
@@ -79,7 +79,7 @@ def fixture_run(tmp_path, monkeypatch, capsys):
                     elif "--port" in words:
                         plant.enter_context(served(words))
                     else:
-                        assert main(words[1:]) == 0, words
+                        assert run_command_line(words[1:]) == 0, words
                         printed.append((words, capsys.readouterr().out))
                 if "--port" not in block[0]:
                     plant.close()
@@ -136,9 +136,12 @@ def test_the_agent_beats_the_tuned_pi_controller(run, capsys):
     agents = [agent]
     (serving,) = [w for w, _ in printed if w[1] == "serve" and "--agent" in w]
     for seed in ("1", "2"):
-        assert main(["train", "fitted.toml", "--output", f"agent{seed}", "--seed", seed]) == 0
+        assert (
+            run_command_line(["train", "fitted.toml", "--output", f"agent{seed}", "--seed", seed])
+            == 0
+        )
         capsys.readouterr()
         words = [f"agent{seed}" if word == "agent" else word for word in serving]
-        assert main(words[1:]) == 0
+        assert run_command_line(words[1:]) == 0
         agents.append(float(REACHED.search(capsys.readouterr().out)[1]))
     assert statistics.median(agents) > pi

@@ -13,7 +13,7 @@ from PIL import Image
 
 import fmugym
 from fmugym.envs.house import HOUSE_TASK
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "tutorial.md"
 TEXT = DOCUMENT.read_text(encoding="utf-8")
@@ -49,7 +49,7 @@ def test_its_commands_run(tmp_path, monkeypatch, capsys):
         if words[0] == "python":
             subprocess.run([sys.executable, *words[1:]], check=True, timeout=60)
         elif words[0] == "fmugym":
-            assert main(shortened(words)[1:]) == 0, words
+            assert run_command_line(shortened(words)[1:]) == 0, words
             printed[words[1]] = capsys.readouterr().out
     told = {"info", "new", "validate", "simulate", "train", "evaluate"}
     assert told == set(printed)

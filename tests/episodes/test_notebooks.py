@@ -8,7 +8,7 @@ from fmu_tools import HERE
 
 import fmugym
 from fmugym.envs import CartPoleEnv
-from fmugym.episodes.progress_bars import no_progress, progress
+from fmugym.episodes.progress_bars import no_progress, progress_bar
 
 
 def test_objects_are_shown_in_one_informative_line(make_envs):
@@ -74,9 +74,9 @@ def test_bars_are_shown_in_notebooks(monkeypatch):
 
     stream = type("OutStream", (), {"__module__": "ipykernel.iostream", "isatty": lambda _: False})
     monkeypatch.setitem(sys.modules, "tqdm", types.SimpleNamespace(tqdm=Bar))
-    with progress(7, "play") as advance:
+    with progress_bar(7, "play") as advance:
         assert advance is no_progress
     monkeypatch.setattr(sys, "stderr", stream())
-    with progress(7, "play") as advance:
+    with progress_bar(7, "play") as advance:
         advance(3)
     assert drawn == [7, 3]

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.progress_bars import progress_bar
 
 
 class Terminal(io.StringIO):
@@ -19,7 +19,7 @@ def test_parts_of_steps_are_rounded(monkeypatch):
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setattr("tqdm.tqdm.monitor_interval", 0)
     seen = []
-    with progress(10 / 3, "fit", "simulations") as advance:
+    with progress_bar(10 / 3, "fit", "simulations") as advance:
         bar = next(
             one.cell_contents for one in advance.__closure__ if hasattr(one.cell_contents, "n")
         )

@@ -31,7 +31,7 @@ from letters import wide
 import fmugym
 from fmugym import ConfigError
 from fmugym.export import Layer, Network, agent_of, write_c
-from fmugym.export.operations import HELPERS, TYPES, constant, expression
+from fmugym.export.operations import C_TYPES, HELPERS, constant, expression
 from fmugym.expressions.program import operation_of
 
 BALANCING = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.5, 10.0, 2.0]], np.float32)
@@ -469,7 +469,7 @@ class TestFunctions:
 
     @pytest.mark.parametrize("letter", "df")
     def test_of_numpy(self, letter, tmp_path):
-        helpers, lines, kind = {}, [], TYPES[letter]
+        helpers, lines, kind = {}, [], C_TYPES[letter]
 
         def use(name, letter):
             return helpers.setdefault(name, f"own_{name}")
@@ -507,7 +507,7 @@ class TestFunctions:
         ],
     )
     def test_constants_keep_all_bits(self, value, letter, tmp_path):
-        kind, text = TYPES[letter], constant(value, letter)
+        kind, text = C_TYPES[letter], constant(value, letter)
         includes = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>"
         library = built(f"{includes}\n{kind} value = {text};", tmp_path)
         dtype = np.dtype(letter)

@@ -29,7 +29,7 @@ from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import Operations
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.program import operation_of
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 
 onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
 runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
@@ -58,7 +58,7 @@ class TestSearch(test_export_search.Agents):
 
     def test_the_memory_is_json_without_nan(self, tmp_path):
         env = heater(HEATERS["a controller"][0])
-        path = write_onnx(agent_of(env, Agent("by hand", HEAT)), tmp_path / "agent.onnx")
+        path = write_onnx(agent_of(env, ResidualAgent("by hand", HEAT)), tmp_path / "agent.onnx")
         facts = runtime.InferenceSession(str(path)).get_modelmeta().custom_metadata_map
         assert json.loads(facts["memory"])["agent_controller"] == [0.0, None]
         env.close()

@@ -21,11 +21,11 @@ from fmugym.baselines import controller_of as controller_from
 from fmugym.baselines.table_texts import table_in
 from fmugym.export import agent_of, write_c, write_fmu
 from fmugym.linearization import linearize
-from fmugym.search.policy import Agent, Policy
+from fmugym.search.policy import ResidualAgent, ResidualPolicy
 
 UNSCALED = np.array([[0.0], [1.0]])
-LINEAR = Agent("by hand", None, 1, 1)  # each task replaces the sizes
-HISTORY = Agent("by hand", None, 1, 1, history=True)
+LINEAR = ResidualAgent("by hand", None, 1, 1)  # each task replaces the sizes
+HISTORY = ResidualAgent("by hand", None, 1, 1, history=True)
 PAIR = {
     "variables": HEATING["variables"] | {"gains": {"name": "Q_int", "min": 0, "max": 500}},
     "agent": PRESENT | {"actions": ["u", "gains"]},
@@ -44,11 +44,11 @@ HEATERS = {
     "a change": (TASKS["change"], HEAT, HISTORY),
     "a rate": (TASKS["rate"], None, HISTORY),
     "levels": (TASKS["levels"], HEAT, LINEAR),
-    "memory": (TASKS["memory"], None, Agent("by hand", None, 1, 1, hidden=8)),
+    "memory": (TASKS["memory"], None, ResidualAgent("by hand", None, 1, 1, hidden=8)),
     "a schedule": ({"agent": PRESENT}, "schedule 00:30=0.7 05:00=0.2 07:00=1", HISTORY),
     "a table": (PAIR, CASCADE, None),
     "a table and a history": (PAIR, CASCADE, HISTORY),
-    "two actions": (PAIR, None, Agent("by hand", None, 1, 1, hidden=16, history=True)),
+    "two actions": (PAIR, None, ResidualAgent("by hand", None, 1, 1, hidden=16, history=True)),
 }  # fmt: skip
 
 
@@ -59,9 +59,9 @@ def heater(task):
 
 def agent_for(env, text, form, seed=0):
     """An agent with random weights, which sees values around those at the beginning."""
-    known, rng = Policy(None).bind(env), np.random.default_rng(seed)
+    known, rng = ResidualPolicy(None).bind(env), np.random.default_rng(seed)
     if form is None:
-        return Agent("by hand", text)
+        return ResidualAgent("by hand", text)
     form = replace(form, observed=form.observed and len(known.names), acting=known.acting)
     values = gymnasium.spaces.flatten(env.observation_space, env.reset(seed=seed)[0])
     count = form.features
@@ -207,7 +207,7 @@ class Agents:
         ("text", "form"),
         [
             (None, HISTORY),
-            (None, Agent("by hand", None, 1, 1, hidden=8)),
+            (None, ResidualAgent("by hand", None, 1, 1, hidden=8)),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", None),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", HISTORY),
         ],
@@ -229,8 +229,8 @@ class Agents:
         ("text", "form"),
         [
             (None, None),
-            (None, Agent("by hand", None, 0, 1)),
-            ("pid of=T setpoint=21 kp=0.001", Agent("by hand", None, 0, 1)),
+            (None, ResidualAgent("by hand", None, 0, 1)),
+            ("pid of=T setpoint=21 kp=0.001", ResidualAgent("by hand", None, 0, 1)),
         ],
     )
     def test_of_a_constant(self, text, form, tmp_path):
@@ -271,9 +271,9 @@ class TestInC(Agents):
 
     def test_of_a_controller_in_python(self, tmp_path):
         env, texts = heater({"agent": PRESENT}), []
-        policy = Agent("by hand", HEAT).policy().bind(env)
+        policy = ResidualAgent("by hand", HEAT).policy().bind(env)
         policy.act(np.array([20.0, 1.0]))
-        for model in (policy, controller_from(HEAT), Agent("by hand", HEAT)):
+        for model in (policy, controller_from(HEAT), ResidualAgent("by hand", HEAT)):
             folder = tmp_path / str(len(texts))
             folder.mkdir()
             texts.append(write_c(agent_of(env, model), folder)[1].read_text())
@@ -308,7 +308,7 @@ class TestRefused:
     def test_a_task_in_the_form_for_agents(self, load):
         env = load(HEATING | {"agent": PRESENT})
         with pytest.raises(ConfigError, match=r"physical"):
-            agent_of(env, Agent("by hand", HEAT))
+            agent_of(env, ResidualAgent("by hand", HEAT))
 
     def test_another_task(self):
         env, other = heater({"agent": PRESENT}), heater(TASKS["forecast"])

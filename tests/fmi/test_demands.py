@@ -6,7 +6,7 @@ from fmu_tools import PlainEnv, library_name, probe_config, probe_fmu, probe_lib
 import fmugym
 from fmugym import FMU
 from fmugym.fmi.words import as_messages, asked_for, quoted
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 from fmugym.tools.proposal import Proposal
 from fmugym.tools.skeleton import Skeleton
 
@@ -114,10 +114,10 @@ def test_validation_offers_the_cure(tmp_path, capsys):
     text = Proposal(FMU(path), tmp_path).text()
     file = tmp_path / "task.toml"
     file.write_text(text.replace("stop_time =", "# stop_time ="))
-    assert main(["validate", str(file)]) > 0
+    assert run_command_line(["validate", str(file)]) > 0
     said = capsys.readouterr()
     assert "cure: set stop_time in the config" in said.out + said.err
     file.write_text(text)
-    main(["validate", str(file)])
+    run_command_line(["validate", str(file)])
     said = capsys.readouterr()
     assert "stop_time in the config" not in said.out + said.err

@@ -29,7 +29,7 @@ from pool_tools import sampled
 
 import fmugym
 from fmugym import FMU, FMUGymError
-from fmugym.archive.bundled import BUNDLED, bundled_fmu
+from fmugym.archive.bundled import BUNDLED_FMUS, bundled_fmu
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
@@ -292,7 +292,7 @@ def tasks():
 
 def cases():
     """The functions by name."""
-    found = {f"bundled {m} {v}": partial(bundled, m, v) for m, v in BUNDLED}
+    found = {f"bundled {m} {v}": partial(bundled, m, v) for m, v in BUNDLED_FMUS}
     for model, version, solver in product(MODELS, (1, 2, 3), SOLVERS):
         found[f"exchange {model} {version} {solver}"] = partial(exchange, model, version, solver)
     for name, version, master in product(("pendulum", "masses", "tank"), (2, 3), MASTERS):

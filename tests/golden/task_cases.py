@@ -33,7 +33,7 @@ from makers import by_python
 import fmugym
 from fmugym import Uniform
 from fmugym.export import agent_of, write_c, write_fmu, write_onnx
-from fmugym.tools.cli import main
+from fmugym.tools.cli import run_command_line
 
 TASKS = Path(__file__).with_name("tasks")
 BUNDLED = ("CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum", "House")
@@ -405,7 +405,10 @@ def training(name, rounds, folder):
 def trained(name, folder, rounds):
     output = folder / f"agent of {Path(name).stem}"
     arguments = ["--rounds", str(rounds), "--seed", "1", "--episodes", "3", "--quiet"]
-    assert main(["train", str(files(folder) / name), "--output", str(output), *arguments]) == 0
+    assert (
+        run_command_line(["train", str(files(folder) / name), "--output", str(output), *arguments])
+        == 0
+    )
     return output
 
 

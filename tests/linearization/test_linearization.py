@@ -13,12 +13,12 @@ from pythonfmu.builder import FmuBuilder
 from scipy.linalg import expm
 
 import fmugym
-from fmugym.archive.bundled import BUNDLED
+from fmugym.archive.bundled import BUNDLED_FMUS
 from fmugym.linearization import linearize
 
 M, L, B, G, V_C = 0.06, 0.1, 4e-4, 9.81, 0.05  # of the bundled pendulum
 with_derivatives = pytest.mark.parametrize(
-    ("model", "version"), [pair for pair in BUNDLED if pair[1] != "1.0"], ids="-".join
+    ("model", "version"), [pair for pair in BUNDLED_FMUS if pair[1] != "1.0"], ids="-".join
 )
 each_version = pytest.mark.parametrize("version", ["2.0", "3.0"])
 

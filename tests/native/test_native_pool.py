@@ -14,7 +14,7 @@ import pytest
 from plants import ONCE
 
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
-from fmugym.archive.bundled import BUNDLED
+from fmugym.archive.bundled import BUNDLED_FMUS
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
@@ -373,7 +373,7 @@ class TestIsolation:
         assert pool.step()[1].tolist() == [Status.FATAL, Status.OK]
         assert pool.reset((), np.zeros((0, 2)))[0].tolist() == [[1, 1]]
 
-    @pytest.mark.parametrize(("model", "version"), BUNDLED)
+    @pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
     def test_bundled_fmus_share_nothing(self, model, version):
         assert not disturb(FMU(bundled_fmu(model, version)))
 

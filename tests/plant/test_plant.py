@@ -37,7 +37,7 @@ from fmugym.lab import RealClock
 from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
 from fmugym.plant.feed import _time_of_year
-from fmugym.plant.polling import LostError, Poller
+from fmugym.plant.polling import ConnectionLostError, Poller
 from fmugym.plant.serving import environment
 from fmugym.plant.tags import read_plant
 from fmugym.series import RecordSeries
@@ -340,7 +340,7 @@ class Parting:
             await asyncio.sleep(1e6)
 
     async def read(self):
-        raise LostError("it is gone")
+        raise ConnectionLostError("it is gone")
 
 
 def test_a_loss_is_told_before_the_goodbye():

@@ -15,7 +15,7 @@ from fmugym import FMU, bundled_fmu
 from fmugym.linearization import linearize_along
 from fmugym.pool.form import form_of_listing
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import Component
+from fmugym.systems.system_plan import ComponentPlan
 
 ALIASES = (
     ("minus_a", 0, "input", "continuous", '<Real start="0" min="-3" max="1"/>'),
@@ -52,7 +52,7 @@ def path(tmp_path_factory):
 
 
 def system_of(path):
-    parts = Component("plant", path), Component("other", bundled_fmu("Pendulum"))
+    parts = ComponentPlan("plant", path), ComponentPlan("other", bundled_fmu("Pendulum"))
     return SystemFMU(system(parts, ()))
 
 

@@ -15,11 +15,11 @@ from system_tools import system
 from wine_tools import for_windows
 
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
-from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, is_bundled
+from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS, MODELS, is_bundled
 from fmugym.archive.texts import with_texts
 from fmugym.fmi import Status
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import Component
+from fmugym.systems.system_plan import ComponentPlan
 
 OPTIONS = {
     "fmpy": {"backend": "fmpy"},
@@ -42,7 +42,7 @@ PAIRS = [
 def all_plants():
     """Each implementation with each version of FMI, whose models take turns."""
     for shift, version in enumerate(FMI_VERSIONS):
-        models = [one for one in BUNDLED if one[1] == version]
+        models = [one for one in BUNDLED_FMUS if one[1] == version]
         for index, name in enumerate(OPTIONS):
             yield name, *models[(index + shift) % len(models)]
 
@@ -88,7 +88,7 @@ def make_pool(request, pools_of):
 
 def system_of(path):
     """A system of an FMU and a pendulum, whose variables can be looked up by the FMU's names."""
-    components = Component("plant", path), Component("other", bundled_fmu("Pendulum"))
+    components = ComponentPlan("plant", path), ComponentPlan("other", bundled_fmu("Pendulum"))
     both = SystemFMU(system(components, ()))
     both.variable = lambda name: both.description.variable(f"plant.{name}")
     return both

@@ -14,7 +14,7 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
 import fmugym
-from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, bundled_fmu
+from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS, MODELS, bundled_fmu
 
 ROOT = Path(__file__).parents[2]
 STATES = {
@@ -46,7 +46,7 @@ INPUTS = {
 @pytest.mark.skipif(
     sys.platform == "win32", reason="the FMUs are built and released on Linux and macOS"
 )
-@pytest.mark.parametrize(("model", "version"), BUNDLED)
+@pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
 def test_linux_libraries_are_rebuilt_byte_for_byte(model, version, tmp_path, monkeypatch):
     pytest.importorskip("ziglang", reason="needs the extra test, which brings the compiler")
     monkeypatch.syspath_prepend(str(ROOT / "resources"))
@@ -93,12 +93,12 @@ def test_c_sources_of_fmus_include_what_they_call():
                 assert other in needs[caller], f"{caller}.c calls functions of {other}.c"
 
 
-@pytest.mark.parametrize(("model", "version"), BUNDLED)
+@pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
 def test_validation_finds_no_problem(model, version):
     assert validate_fmu(str(bundled_fmu(model, version))) == []
 
 
-@pytest.mark.parametrize(("model", "version"), BUNDLED)
+@pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
 def test_libraries_for_all_platforms(model, version):
     platforms = {
         "1.0": ("darwin64", "linux64", "win64"),
@@ -127,7 +127,7 @@ def test_macos_library_is_for_both_processors(model):
 @pytest.mark.parametrize("model", MODELS)
 def test_descriptions_agree_between_the_versions(model):
     """Names, units, limits and start values; what FMI 1.0 cannot say is left out."""
-    versions = [v for v in FMI_VERSIONS if (model, v) in BUNDLED]
+    versions = [v for v in FMI_VERSIONS if (model, v) in BUNDLED_FMUS]
     described = [fmugym.FMU(bundled_fmu(model, v)).description for v in versions]
 
     def facts(variable):
@@ -186,7 +186,7 @@ class Driver:
         return np.array(self.fmu.getDirectionalDerivative(*arguments))
 
 
-@pytest.fixture(params=[pair for pair in BUNDLED if pair[1] != "1.0"], ids="-".join)
+@pytest.fixture(params=[pair for pair in BUNDLED_FMUS if pair[1] != "1.0"], ids="-".join)
 def driver(request, tmp_path):
     made = Driver(*request.param, tmp_path)
     yield made

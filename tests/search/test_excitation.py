@@ -6,20 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.envs import CartPoleEnv, PendulumEnv
 from fmugym.search.excitation import excite
-from fmugym.search.policy import Agent
+from fmugym.search.policy import ResidualAgent
 from fmugym.surrogate.courses import Courses
 
 
 def excited(make_env, envs, steps=60, count=7):
     courses = Courses()
     acting = {PendulumEnv: 1, CartPoleEnv: 2}[make_env]  # two levels
-    probe = SimpleNamespace(agents=[Agent("constant action", acting=acting)], is_same=False)
-    with closing(Arena(make_env, envs, steps, backend=courses)) as arena:
-        excite(arena, courses, probe, count, np.random.default_rng(5))
-        assert arena.steps == courses.steps
+    probe = SimpleNamespace(agents=[ResidualAgent("constant action", acting=acting)], is_same=False)
+    with closing(CandidateEvaluator(make_env, envs, steps, backend=courses)) as evaluator:
+        excite(evaluator, courses, probe, count, np.random.default_rng(5))
+        assert evaluator.steps == courses.steps
     return [one for one in courses.all() if one.steps]
 
 

@@ -9,7 +9,7 @@ from makers import by_python
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator
 from fmugym.baselines.parsing import search_of
 from fmugym.search.guessing import Loops, guessed_controllers, suggested_controllers
 from fmugym.search.pairing import best_pairing, niederlinski_index, relative_gains
@@ -235,8 +235,8 @@ def responses_of(task, envs=256):
     make = partial(fmugym.load, task, physical=True)
     with closing(make()) as env:
         loops = Loops.of(task.document, env)
-    with closing(Arena(make, envs, loops.most_steps)) as arena:
-        return loops, step_test(arena, loops.limits), arena.steps
+    with closing(CandidateEvaluator(make, envs, loops.most_steps)) as evaluator:
+        return loops, step_test(evaluator, loops.limits), evaluator.steps
 
 
 def guessed(task):
@@ -356,9 +356,9 @@ def test_the_two_zones(most, example, tmp_path):
     make = partial(fmugym.load, path, physical=True)
     with closing(make()) as env:
         loops = Loops.of(env.task.document, env)
-    with closing(Arena(make)) as arena:
-        guesses = suggested_controllers(arena, loops, most)
-        assert most - 21 < arena.steps <= most
+    with closing(CandidateEvaluator(make)) as evaluator:
+        guesses = suggested_controllers(evaluator, loops, most)
+        assert most - 21 < evaluator.steps <= most
     assert [*guesses] == ["PI", "P"]
     expected = {"u_hp": ("T_tank", True), "v1": ("T1", True), "v2": ("T2", True)}
     assert loops_of(guesses["PI"]) == loops_of(guesses["P"]) == expected

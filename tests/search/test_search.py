@@ -1,4 +1,4 @@
-"""The search for policies: its steps against known optima, and what policies and arenas do."""
+"""The search for policies: its steps against known optima, and what policies and evaluators do."""
 
 import itertools
 import json
@@ -19,14 +19,19 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.baselines import PID, controller_of
 from fmugym.baselines import cma as covariance
-from fmugym.baselines.arena import MOST_STEPS, Arena, CeilingError, Outcome
+from fmugym.baselines.candidate_evaluation import (
+    MOST_STEPS,
+    CandidateEvaluator,
+    CandidateScores,
+    CeilingError,
+)
+from fmugym.baselines.candidate_search import CandidateSearch
 from fmugym.baselines.cma import CMA
-from fmugym.baselines.entrants import Entrant
 from fmugym.baselines.parsing import search_of
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
-from fmugym.search.flattening import require_numbers, rows_of
-from fmugym.search.policy import AGENT, LIMIT, Agent, Policy, scale_of
+from fmugym.search.flattening import flattened_observations, require_numbers
+from fmugym.search.policy import LIMIT, POLICY_FILE, ResidualAgent, ResidualPolicy, scale_of
 from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
 from fmugym.surrogate.surrogate_pool import SurrogatePool
@@ -223,8 +228,8 @@ SEEDS = [3, 700_000, 41]
 
 
 def played(make_env, make=pid, numbers=GAINS, seeds=SEEDS, **arguments):
-    with closing(Arena(make_env, **arguments)) as arena:
-        return arena.play(make, numbers, seeds), arena
+    with closing(CandidateEvaluator(make_env, **arguments)) as evaluator:
+        return evaluator.play(make, numbers, seeds), evaluator
 
 
 class TestArena:
@@ -249,20 +254,20 @@ class TestArena:
         """Where there may be no more of them, a few episodes play in many environments."""
         opened = []
         make = load()
-        with closing(Arena(lambda: opened.append(1) or make(), 15)) as arena:
+        with closing(CandidateEvaluator(lambda: opened.append(1) or make(), 15)) as evaluator:
             for _ in range(3):
-                arena.play(pid, GAINS, SEEDS)
-                arena.play(pid, GAINS[:1], SEEDS[:1])
+                evaluator.play(pid, GAINS, SEEDS)
+                evaluator.play(pid, GAINS[:1], SEEDS[:1])
             first = len(opened)
-            arena.play(pid, GAINS, SEEDS)
+            evaluator.play(pid, GAINS, SEEDS)
             assert len(opened) == first
-            assert arena._envs.num_envs == 15
+            assert evaluator._envs.num_envs == 15
 
     def test_a_second_play_is_like_the_first(self):
-        with closing(Arena(load())) as arena:
-            first = arena.play(pid, GAINS, SEEDS)
-            arena.play(pid, GAINS[:1], [1])
-            assert arena.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
+        with closing(CandidateEvaluator(load())) as evaluator:
+            first = evaluator.play(pid, GAINS, SEEDS)
+            evaluator.play(pid, GAINS[:1], [1])
+            assert evaluator.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
 
     @pytest.mark.parametrize("most_envs", [512, 7])
     @pytest.mark.parametrize("kind", ["arrays", "one by one", "process"])
@@ -281,29 +286,29 @@ class TestArena:
                 for seed in SEEDS:
                     controller.reset()
                     lengths.append(episode(env, controller, seed)[2])
-        with closing(Arena(make, most_envs, limits={"effort": 1.0})) as arena:
-            outcome = arena.play(pid, GAINS, SEEDS)
-            stepped = arena._envs.health["steps"].sum()
-        assert stepped == arena.steps == sum(lengths)
+        with closing(CandidateEvaluator(make, most_envs, limits={"effort": 1.0})) as evaluator:
+            outcome = evaluator.play(pid, GAINS, SEEDS)
+            stepped = evaluator._envs.health["steps"].sum()
+        assert stepped == evaluator.steps == sum(lengths)
         assert len(set(lengths)) > 3
         expected, _ = played(load(), limits={"effort": 1.0})
         assert outcome.returns == pytest.approx(expected.returns, rel=1e-12)
         assert outcome.costs == pytest.approx(expected.costs, rel=1e-12)
 
     def test_the_ceiling_holds(self):
-        with closing(Arena(load(terminated=None))) as arena:
-            arena.ceiling = 15 * 40 + 70
-            arena.play(pid, GAINS, SEEDS)
+        with closing(CandidateEvaluator(load(terminated=None))) as evaluator:
+            evaluator.ceiling = 15 * 40 + 70
+            evaluator.play(pid, GAINS, SEEDS)
             with pytest.raises(CeilingError, match="670"):
-                arena.play(pid, GAINS, SEEDS)
-            assert arena.steps == 15 * 44
+                evaluator.play(pid, GAINS, SEEDS)
+            assert evaluator.steps == 15 * 44
 
     def test_episodes_without_an_end_are_stopped(self):
         endless = load(terminated=None, episode_length=None, reward=1, costs=None)
         outcome, _ = played(endless, numbers=GAINS[:1], seeds=[0])
         assert outcome.returns.item() == MOST_STEPS == 10_000
-        outcome, arena = played(endless, numbers=GAINS[:2], seeds=[0], most_steps=7)
-        assert (outcome.returns.ravel().tolist(), arena.steps) == ([7, 7], 14)
+        outcome, evaluator = played(endless, numbers=GAINS[:2], seeds=[0], most_steps=7)
+        assert (outcome.returns.ravel().tolist(), evaluator.steps) == ([7, 7], 14)
 
 
 def episode(env, controller, seed, costs=()):
@@ -326,10 +331,10 @@ def test_costs_beyond_their_limits_come_first():
     """Returns 5, 9, 7, 1; two costs, of which the second has no room at all; no faults."""
     costs = np.array([[[1.0, 0.0, 0]], [[4.0, 0.0, 0]], [[2.0, 0.5, 0]], [[2.0, -1.0, 0]]])
     returns = np.array([[5.0], [9.0], [7.0], [1.0]])
-    merits = Outcome(returns, costs, {"a": 2.0, "b": 0.0}, NOTHING).merits
+    merits = CandidateScores(returns, costs, {"a": 2.0, "b": 0.0}, NOTHING).merits
     assert merits == [(0.0, 5.0), (-1.0, 9.0), (-0.5, 7.0), (0.0, 1.0)]
     assert sorted(range(4), key=merits.__getitem__, reverse=True) == [0, 3, 2, 1]
-    without = Outcome(returns, costs[..., 2:], {}, NOTHING).merits
+    without = CandidateScores(returns, costs[..., 2:], {}, NOTHING).merits
     assert [merit for _, merit in without] == [5, 9, 7, 1]
 
 
@@ -337,7 +342,7 @@ def test_what_is_no_number_comes_last():
     """Neither a NaN among the rewards nor one among the costs has an order."""
     returns = np.array([[np.nan, 9.0], [-1e9, -1e9], [7.0, 7.0], [1.0, 1.0]])
     costs = np.array([[[0.0, 0]] * 2, [[9.0, 0]] * 2, [[np.nan, 0], [0, 0]], [[0.0, 0]] * 2])
-    merits = Outcome(returns, costs, {"a": 1.0}, NOTHING).merits
+    merits = CandidateScores(returns, costs, {"a": 1.0}, NOTHING).merits
     for order in itertools.permutations(range(4)):
         assert sorted(order, key=merits.__getitem__, reverse=True)[:2] == [3, 1]
 
@@ -345,14 +350,14 @@ def test_what_is_no_number_comes_last():
 def test_a_search_among_what_is_no_number_goes_on():
     """All its first candidates reach NaN."""
     rng = np.random.default_rng(0)
-    entrant = Entrant(CMA(np.zeros(2), 1.0, 8, rng), Agent("own"), 2)
+    candidate_search = CandidateSearch(CMA(np.zeros(2), 1.0, 8, rng), ResidualAgent("own"), 2)
     for most in (np.nan, 1.0):
         for _ in range(5):
-            entrant.play(Field(most), range(2))
-        entrant.validate(Field(most), range(2))
-        assert entrant.best is not None
-    assert np.isfinite(entrant.merit).all()
-    assert entrant.best.weights.shape == (2,)
+            candidate_search.play(Field(most), range(2))
+        candidate_search.validate(Field(most), range(2))
+        assert candidate_search.best is not None
+    assert np.isfinite(candidate_search.merit).all()
+    assert candidate_search.best.weights.shape == (2,)
 
 
 @pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
@@ -363,7 +368,7 @@ def test_faults_come_last_where_they_are_no_end(on_fault):
     """
     changes = {"reward": "log(0.05 - tau) - 9", "config": {"on_fault": on_fault}, "costs": None}
     weights = np.array([[1.0], [-1.0], [-0.5]])
-    outcome, _ = played(load(**changes), Agent("own", acting=1), weights)
+    outcome, _ = played(load(**changes), ResidualAgent("own", acting=1), weights)
     is_end = on_fault == "terminate"
     assert outcome.costs[..., -1].tolist() == [[0.0 if is_end else 1.0] * 3, [0.0] * 3, [0.0] * 3]
     order = sorted(range(3), key=outcome.merits.__getitem__, reverse=True)
@@ -418,8 +423,8 @@ def test_rows_are_those_of_gymnasium(space):
     observations = batch.sample()
     singles = list(gym.vector.utils.iterate(batch, observations))
     expected = [spaces.flatten(space, one).astype(float).tolist() for one in singles]
-    assert rows_of(space, observations, 5).tolist() == expected
-    assert [rows_of(space, one, 1)[0].tolist() for one in singles] == expected
+    assert flattened_observations(space, observations, 5).tolist() == expected
+    assert [flattened_observations(space, one, 1)[0].tolist() for one in singles] == expected
     assert {len(row) for row in expected} == {spaces.flatdim(space)}
     require_numbers(space, NUMBERS)
 
@@ -445,11 +450,11 @@ def test_spaces_without_a_search(observed, acting, facts):
 
 
 FORMS = [  # for 3 observations and 2 outputs
-    Agent("linear", None, 3, 2),
-    Agent("linear with history", None, 3, 2, history=True),
-    Agent("network", None, 3, 2, hidden=5),
-    Agent("network with history", None, 3, 2, hidden=4, history=True),
-    Agent("constant action", None, 0, 2),
+    ResidualAgent("linear", None, 3, 2),
+    ResidualAgent("linear with history", None, 3, 2, history=True),
+    ResidualAgent("network", None, 3, 2, hidden=5),
+    ResidualAgent("network with history", None, 3, 2, hidden=4, history=True),
+    ResidualAgent("constant action", None, 0, 2),
 ]
 ACTING = [
     spaces.Box(np.array([-2.0, 10.0]), np.array([4.0, 30.0]), dtype=np.float64),
@@ -463,12 +468,12 @@ UNSCALED = np.array([[0.0], [1.0]])
 
 
 def policy_of(form, weights, scale=UNSCALED, baseline=None):
-    return Policy(baseline, replace(form, weights=weights, scale=scale))
+    return ResidualPolicy(baseline, replace(form, weights=weights, scale=scale))
 
 
 def sized(form, env):
     """The form for an environment."""
-    bare = Policy(None).bind(env)
+    bare = ResidualPolicy(None).bind(env)
     return replace(form, observed=form.observed and len(bare.names), acting=bare.acting)
 
 
@@ -482,9 +487,9 @@ def policy_with(form, env_of_one, seed=0, rows=None, baseline=None):
 
 class TestPolicy:
     def test_without_weights_it_is_the_controller(self, env):
-        policy, controller = Policy(pid(GAINS[3:4])).bind(env), pid(GAINS[3:4]).bind(env)
+        policy, controller = ResidualPolicy(pid(GAINS[3:4])).bind(env), pid(GAINS[3:4]).bind(env)
         assert episode(env, policy, 4) == episode(env, controller, 4)
-        assert Policy(None).bind(env).act(np.zeros(2)) == 0.0
+        assert ResidualPolicy(None).bind(env).act(np.zeros(2)) == 0.0
 
     def test_corrections_are_halves_of_the_range_and_end_at_its_limits(self):
         env = Stub(NUMBERS, ACTING[0])
@@ -503,9 +508,9 @@ class TestPolicy:
         """It asks for more than there is; the correction begins at the limit."""
         env = Stub(spaces.Box(-9, 9, (1,)), spaces.Box(0.0, 2.0, (1,), np.float64), names=("T",))
         weights = np.array([0.0, -0.25 * np.sqrt(2)])
-        policy = policy_of(Agent("own", None, 1, 1), weights, baseline=PID("T", 8.0, kp=1.0)).bind(
-            env
-        )
+        policy = policy_of(
+            ResidualAgent("own", None, 1, 1), weights, baseline=PID("T", 8.0, kp=1.0)
+        ).bind(env)
         assert policy.act(np.zeros(1)) == pytest.approx(2.0 - 0.25)
         assert policy.act(np.array([7.5])) == pytest.approx(0.5 - 0.25)
         assert policy.act(np.array([7.9])) == 0.0
@@ -514,7 +519,7 @@ class TestPolicy:
         env = Stub(spaces.Box(-1e9, 1e9, (1,)), spaces.Box(-1e3, 1e3, (1,), np.float64))
         scale = np.array([[5.0], [2.0]])
         weights = np.array([np.sqrt(2) / 1e3, 0.0])
-        policy = policy_of(Agent("own", None, 1, 1), weights, scale).bind(env)
+        policy = policy_of(ResidualAgent("own", None, 1, 1), weights, scale).bind(env)
         seen = [policy.act(np.array([value])).item() for value in (8.0, 1e9, -1e9)]
         assert seen == pytest.approx([1.5, LIMIT, -LIMIT])
 
@@ -711,23 +716,23 @@ def test_a_process_that_constants_drive_away_can_be_controlled(tmp_path):
         feedback = SimpleNamespace(act=lambda x, _: np.clip(-gains @ x, -1, 1))
         by_feedback, _, _ = episode(env, feedback, 0)
     search = Search(Probe.of(make, 256, print), 0)
-    with closing(Arena(make)) as arena:
+    with closing(CandidateEvaluator(make)) as evaluator:
         while search.rounds < 60:
-            search.advance(arena)
+            search.advance(evaluator)
     assert search.ahead.merit[1] > 1.7 * by_feedback
 
 
 def test_a_scale_is_that_of_all_features(env):
     """Of the steps of all episodes until their ends, whatever plays beside them."""
     observed = []
-    form = Agent("own", None, 2, 1, history=True)
+    form = ResidualAgent("own", None, 2, 1, history=True)
     rows = np.array([np.zeros(form.size)] * 4)
     rows[:, -1] = np.sqrt(8) * np.array([-1.0, -0.3, 0.2, 0.9])
     make = form
     scales = []
     for most_envs in (3, 512):
-        with closing(Arena(load(), most_envs)) as arena:
-            moments = arena.play(make, rows, SEEDS, has_moments=True).moments.sum(axis=(0, 1))
+        with closing(CandidateEvaluator(load(), most_envs)) as evaluator:
+            moments = evaluator.play(make, rows, SEEDS, has_moments=True).moments.sum(axis=(0, 1))
             scales.append(scale_of(moments))
     assert np.array_equal(*scales)
     for weights in rows:
@@ -763,7 +768,7 @@ def test_a_linear_policy_can_be_extended_by_a_history():
 
 
 class Field:
-    """Stands for an arena in which candidates reach what their numbers add up to, up to a limit."""
+    """An evaluator in whose place candidates reach what their numbers add up to, up to a limit."""
 
     def __init__(self, most):
         self.most = most
@@ -771,7 +776,7 @@ class Field:
     def play(self, make, numbers, seeds, has_moments=False):
         returns = np.repeat(np.minimum(numbers.sum(axis=1), self.most)[:, None], len(seeds), axis=1)
         seen = np.ones((*returns.shape, 1 + 2 * 7))
-        return Outcome(returns, np.zeros((*returns.shape, 1)), {}, seen)
+        return CandidateScores(returns, np.zeros((*returns.shape, 1)), {}, seen)
 
 
 class Needle(Field):
@@ -781,7 +786,7 @@ class Needle(Field):
         near = np.maximum(0.0, 1.0 - np.linalg.norm(numbers - 1.0, axis=1))
         chance = np.random.default_rng(list(seeds)).normal(0.0, 1e-3, (len(numbers), len(seeds)))
         returns = near[:, None] + chance
-        return Outcome(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
+        return CandidateScores(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
 
 
 def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
@@ -790,17 +795,17 @@ def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
     for seed in range(30):
         rng = np.random.default_rng(seed)
         cma = CMA(np.zeros(4), 1.0, 32, rng, largest=30.0, growth=5.0)
-        entrant, field = Entrant(cma, Agent("own"), 4), Needle(1.0)
+        candidate_search, field = CandidateSearch(cma, ResidualAgent("own"), 4), Needle(1.0)
         for _ in range(12):
             for _ in range(5):
-                entrant.play(field, rng.integers(1000, size=4))
-            entrant.validate(field, range(VALIDATION, VALIDATION + 8))
-        found.append(entrant.merit[1] > 0.5)
+                candidate_search.play(field, rng.integers(1000, size=4))
+            candidate_search.validate(field, range(VALIDATION, VALIDATION + 8))
+        found.append(candidate_search.merit[1] > 0.5)
     assert sum(found) >= 25
 
 
 class Noisy:
-    """Stands for an arena and for a search whose candidates are always as different."""
+    """Stands for an evaluator and for a search whose candidates are always as different."""
 
     mean = np.zeros(1)
 
@@ -815,7 +820,7 @@ class Noisy:
 
     def play(self, make, numbers, seeds, has_moments=False):
         returns = numbers + self.rng.normal(0.0, self.noise, (400, len(seeds)))
-        return Outcome(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
+        return CandidateScores(returns, np.zeros((*returns.shape, 1)), {}, NOTHING)
 
 
 @pytest.mark.parametrize(
@@ -826,19 +831,19 @@ class Noisy:
 def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noise, expected):
     """The means of two episodes correlate by 1 / (1 + variance / 2), those of four by more."""
     field = Noisy(noise)
-    entrant = Entrant(field, None, 4)
+    candidate_search = CandidateSearch(field, None, 4)
     for _ in range(120):
-        entrant.play(field, range(entrant.episodes))
-    assert entrant.episodes == expected
+        candidate_search.play(field, range(candidate_search.episodes))
+    assert candidate_search.episodes == expected
 
 
-GIVEN = Agent("given", "pid of=theta setpoint=0 kp=1")
-CONSTANT = Agent("constant action", acting=1)
+GIVEN = ResidualAgent("given", "pid of=theta setpoint=0 kp=1")
+CONSTANT = ResidualAgent("constant action", acting=1)
 
 
 def search_of_agents(*agents):
     """A search with ready agents for two observations and one action."""
-    return Search(Probe({}, Agent("linear", None, 2, 1), agents, {}, 40, False, 0.0, 40), 0)
+    return Search(Probe({}, ResidualAgent("linear", None, 2, 1), agents, {}, 40, False, 0.0, 40), 0)
 
 
 def test_only_the_best_controller_is_tuned_to_the_end():
@@ -849,7 +854,7 @@ def test_only_the_best_controller_is_tuned_to_the_end():
 
     text = "pid of=theta setpoint=0 kp=1..2"
     names = "one", "better", "another"
-    search, field = search_of_agents(*(Agent(name, text) for name in names)), Uneven(1.0)
+    search, field = search_of_agents(*(ResidualAgent(name, text) for name in names)), Uneven(1.0)
     while search.tuning:
         search.advance(field)
     assert [one.rounds for one in search.controllers] == [5, 20, 5]
@@ -925,30 +930,30 @@ class TestAgent:
 
     def test_saved_and_loaded_it_acts_as_before(self, agent, tmp_path):
         agent.save(tmp_path)
-        loaded = Agent.load(tmp_path)
+        loaded = ResidualAgent.load(tmp_path)
         assert replace(loaded, weights=(), scale=(), names=self.NAMES) == replace(
             agent, weights=(), scale=()
         )
-        with closing(Arena(load())) as arena:
-            expected = agent.play(arena, SEEDS)
-            assert loaded.play(arena, SEEDS).returns.tolist() == expected.returns.tolist()
+        with closing(CandidateEvaluator(load())) as evaluator:
+            expected = agent.play(evaluator, SEEDS)
+            assert loaded.play(evaluator, SEEDS).returns.tolist() == expected.returns.tolist()
 
     def test_damaged_files(self, agent, tmp_path):
         """Shorter ones, others, and those with one wrong byte, which may be where nobody looks."""
         agent.save(tmp_path)
-        path = tmp_path / AGENT
+        path = tmp_path / POLICY_FILE
         content = path.read_bytes()
         rng = np.random.default_rng(0)
         lengths = rng.integers(len(content), size=40)
         for damaged in (b"", b"PK", b"text", bytes(len(content)), *(content[:n] for n in lengths)):
             path.write_bytes(damaged)
             with pytest.raises(ConfigError, match=str(tmp_path)):
-                Agent.load(tmp_path)
+                ResidualAgent.load(tmp_path)
         for place in rng.integers(len(content), size=60):
             wrong = bytes([content[place] ^ 255])
             path.write_bytes(content[:place] + wrong + content[place + 1 :])
             with suppress(ConfigError):
-                Agent.load(tmp_path)
+                ResidualAgent.load(tmp_path)
 
     ODD = (
         *(None, True, -1, 2.5, 1e400, 10**30, "x", "pid of=3", "nan", [], {}, [[]], ["1", "2"]),
@@ -959,12 +964,12 @@ class TestAgent:
     def test_files_with_other_values_are_refused_or_act(self, agent, env, tmp_path):
         """Values of another type or size: each of them in the place of each fact."""
         agent.save(tmp_path)
-        facts, refused = json.loads((tmp_path / AGENT).read_text()), 0
+        facts, refused = json.loads((tmp_path / POLICY_FILE).read_text()), 0
         observation, _ = env.reset(seed=0)
         for name, value in itertools.product(facts, self.ODD):
-            (tmp_path / AGENT).write_text(json.dumps({**facts, name: value}))
+            (tmp_path / POLICY_FILE).write_text(json.dumps({**facts, name: value}))
             try:
-                Agent.load(tmp_path).policy().bind(env).act(observation)
+                ResidualAgent.load(tmp_path).policy().bind(env).act(observation)
             except ConfigError as error:
                 refused += bool(str(error))
         assert refused > len(self.ODD) * len(facts) / 2
@@ -982,11 +987,11 @@ class TestAgent:
     )
     def test_facts_of_other_types(self, change, fact, tmp_path):
         numbers = {"weights": np.ones(3), "scale": np.ones((2, 2))}
-        Agent("own", None, 2, 1, names=self.NAMES, **numbers).save(tmp_path)
-        path = tmp_path / AGENT
+        ResidualAgent("own", None, 2, 1, names=self.NAMES, **numbers).save(tmp_path)
+        path = tmp_path / POLICY_FILE
         path.write_text(json.dumps(json.loads(path.read_text()) | change))
         with pytest.raises(ConfigError) as caught:
-            Agent.load(tmp_path)
+            ResidualAgent.load(tmp_path)
         assert fact in str(caught.value)
         assert str(tmp_path) in str(caught.value)
 
@@ -1001,11 +1006,11 @@ class TestAgent:
     )
     def test_arrays_of_another_size(self, change, tmp_path):
         facts = {"weights": np.ones(3), "scale": np.ones((2, 2))}
-        Agent("own", None, 2, 1, names=self.NAMES, **facts).save(tmp_path)
-        assert Agent.load(tmp_path).weights.tolist() == [1, 1, 1]
-        Agent("own", None, 2, 1, names=self.NAMES, **facts | change).save(tmp_path)
+        ResidualAgent("own", None, 2, 1, names=self.NAMES, **facts).save(tmp_path)
+        assert ResidualAgent.load(tmp_path).weights.tolist() == [1, 1, 1]
+        ResidualAgent("own", None, 2, 1, names=self.NAMES, **facts | change).save(tmp_path)
         with pytest.raises(ConfigError, match=r"finite numbers.*\(3,\), \(2, 2\)"):
-            Agent.load(tmp_path)
+            ResidualAgent.load(tmp_path)
 
     @pytest.mark.parametrize(
         ("names", "actions", "facts"),
@@ -1017,7 +1022,7 @@ class TestAgent:
         ],
     )
     def test_another_task_is_told_by_what_differs(self, names, actions, facts, env):
-        agent = Agent("own", None, names=names, actions=actions or str(env.action_space))
+        agent = ResidualAgent("own", None, names=names, actions=actions or str(env.action_space))
         with pytest.raises(ConfigError, match="another task") as caught:
             agent.policy().bind(env)
         for fact in facts:
@@ -1075,7 +1080,7 @@ def searched(folder, document=FALLING, *, told=None, resume=False, rounds=ROUNDS
 
 
 def content(folder):
-    return (folder / AGENT).read_bytes()
+    return (folder / POLICY_FILE).read_bytes()
 
 
 @pytest.fixture
@@ -1099,7 +1104,7 @@ class TestSearch:
         folder, facts = usual
         agents = list(facts["test"])
         assert set(agents) > {"lazy", "tuned pi"}
-        assert agents[0] == facts["agent"] == Agent.load(folder).name
+        assert agents[0] == facts["agent"] == ResidualAgent.load(folder).name
         assert agents[1] == facts["baseline"]
         assert "better than" in facts["verdict"]
         assert "chance" not in facts["verdict"]
@@ -1109,7 +1114,7 @@ class TestSearch:
         """In single environments, by the file alone."""
         folder, facts = usual
         told = rewards(facts, facts["agent"])
-        policy = Agent.load(folder).policy().bind(env)
+        policy = ResidualAgent.load(folder).policy().bind(env)
         for seed, expected in enumerate(told, HELD_OUT_SEED):
             policy.reset()
             assert episode(env, policy, seed)[0] == expected
@@ -1124,11 +1129,11 @@ class TestSearch:
         assert content(folder) != content(usual[0])
 
     def test_training_validation_and_test_never_share_episodes(self, folder, monkeypatch):
-        calls, play = [], Arena.play
+        calls, play = [], CandidateEvaluator.play
         monkeypatch.setattr(
-            Arena,
+            CandidateEvaluator,
             "play",
-            lambda arena, *rest, **more: calls.append(rest) or play(arena, *rest, **more),
+            lambda evaluator, *rest, **more: calls.append(rest) or play(evaluator, *rest, **more),
         )
         searched(folder)
         _, *calls = calls  # the first one was a look at the task
@@ -1144,13 +1149,13 @@ class TestSearch:
         assert firsts == sorted(firsts)  # the test is played once, at the end
 
     def test_equal_episodes_are_played_once(self, folder, monkeypatch):
-        counts, told, play = [], [], Arena.play
+        counts, told, play = [], [], CandidateEvaluator.play
 
-        def spy(arena, make, numbers, seeds, **options):
+        def spy(evaluator, make, numbers, seeds, **options):
             counts.append(len(seeds))
-            return play(arena, make, numbers, seeds, **options)
+            return play(evaluator, make, numbers, seeds, **options)
 
-        monkeypatch.setattr(Arena, "play", spy)
+        monkeypatch.setattr(CandidateEvaluator, "play", spy)
         parameters = {"q_0": "pi", "theta_0": 0.5}
         facts = searched(folder, parameters=parameters, told=told)
         assert counts[0] > 1  # how it knows, and how quick a step is
@@ -1164,7 +1169,7 @@ class TestSearch:
         facts = searched(folder, reward="-abs(tau - 0.05)", controllers=best, told=told)
         assert facts["agent"] == facts["baseline"] == next(iter(facts["test"])) == "best"
         assert [line for line in told if "nothing was found that beats best" in line]
-        agent = Agent.load(folder)
+        agent = ResidualAgent.load(folder)
         assert (agent.text, agent.acting) == ("schedule 00:00=0.05", 0)
 
     def test_limits_of_costs_are_kept(self, folder):
@@ -1225,7 +1230,7 @@ class TestSearch:
         facts = searched(folder, rounds=3, controllers=one)
         assert facts["agent"] == facts["baseline"] == "tuned pi"
         assert facts["rounds"] == 3
-        assert Agent.load(folder).text.startswith("pid of=theta")
+        assert ResidualAgent.load(folder).text.startswith("pid of=theta")
 
     def test_few_rounds_find_no_less_than_what_is_there(self, folder):
         """A controller that is ready takes part from the beginning."""
@@ -1279,7 +1284,9 @@ class TestBudget:
         facts = []
         for seconds, envs in ((100.0, 512), (0.0, 512), (0.0, 11)):
             clock = itertools.count(step=seconds)
-            monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
+            monkeypatch.setattr(
+                "fmugym.baselines.candidate_evaluation.perf_counter", clock.__next__
+            )
             folder = tmp_path / str(len(facts))
             limits = {"rounds": np.inf, "minutes": 1e9, "steps": 20_000, "envs": envs}
             facts.append(searched(folder, **limits) | {"steps": None})
@@ -1331,17 +1338,17 @@ class TestBudget:
         monkeypatch.setattr(Probe, "round_time", lambda *_: 1.0)
         monkeypatch.setattr(twin, "_is_close", lambda *_: False)
 
-        def interrupted(self, arena, cycle):
+        def interrupted(self, evaluator, cycle):
             if cycle == cycles:
                 raise KeyboardInterrupt
-            search(self, arena, cycle)
+            search(self, evaluator, cycle)
 
         monkeypatch.setattr(TwinSearch, "_search", interrupted)
         with pytest.raises(KeyboardInterrupt):
             searched(folder, rounds=np.inf, minutes=0.1)
         assert folder.exists() == is_found
         if is_found:
-            assert Agent.load(folder).text
+            assert ResidualAgent.load(folder).text
 
 
 HIDDEN = {"q_0": "pi", "theta_0": 0.5, "b": {"distribution": "uniform", "low": 0.1, "high": 1}}
@@ -1355,7 +1362,9 @@ class TestProbe:
         found, told = [], []
         for seconds in (100.0, 0.0):
             clock = itertools.count(step=seconds)
-            monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
+            monkeypatch.setattr(
+                "fmugym.baselines.candidate_evaluation.perf_counter", clock.__next__
+            )
             found.append(Probe.of(load(parameters=HIDDEN), envs, told.append))
         slow, fast = found
         assert slow.seconds > fast.seconds

@@ -17,7 +17,7 @@ from fmugym.surrogate.prediction import predicted
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.surrogate import Surrogate
 from fmugym.surrogate.surrogate_fit import fit
-from fmugym.surrogate.terms import Form, Terms, rows_of
+from fmugym.surrogate.terms import SurrogateForm, Terms, regressors_of
 
 
 class Given(Courses):
@@ -59,7 +59,9 @@ def simulated(surrogate, course, begin):
     now = Course(course.starts, course.inputs[:begin], course.outputs[: begin + 1])
     for place in range(begin, course.steps):
         both = np.concatenate([now.outputs, now.outputs[-1:]])
-        row = rows_of(surrogate.terms.form, Course(now.starts, course.inputs[: place + 1], both))
+        row = regressors_of(
+            surrogate.terms.form, Course(now.starts, course.inputs[: place + 1], both)
+        )
         change = surrogate.weights @ surrogate.terms.values(row[:, -1:])[:, 0]
         after = np.clip(now.outputs[-1] + change, surrogate.low, surrogate.high)
         now = Course(now.starts, course.inputs[: place + 1], np.vstack([now.outputs, after]))
@@ -87,9 +89,9 @@ class TestFit:
     @pytest.mark.parametrize(
         ("step", "width", "outputs", "form"),
         [
-            (linear, 2, 2, Form()),
-            (hidden, 2, 1, Form(lags=1)),
-            (limited, 1, 1, Form(limited=(0,))),
+            (linear, 2, 2, SurrogateForm()),
+            (hidden, 2, 1, SurrogateForm(lags=1)),
+            (limited, 1, 1, SurrogateForm(limited=(0,))),
         ],
     )
     def test_the_form_is_that_of_the_equation(self, step, width, outputs, form):
@@ -113,17 +115,19 @@ class TestPrograms:
     @pytest.mark.parametrize(
         "form",
         [
-            Form(),
-            Form(lags=2, quadratic=True),
-            Form(lags=4, tanhs=60, quadratic=True),
-            Form(angles=(1,), tanhs=5, thresholds=((0, 0.4), (1, 0.7))),
-            Form(starts=True, limited=(0,), lags=1, thresholds=((1, 0.5),), quadratic=True),
+            SurrogateForm(),
+            SurrogateForm(lags=2, quadratic=True),
+            SurrogateForm(lags=4, tanhs=60, quadratic=True),
+            SurrogateForm(angles=(1,), tanhs=5, thresholds=((0, 0.4), (1, 0.7))),
+            SurrogateForm(
+                starts=True, limited=(0,), lags=1, thresholds=((1, 0.5),), quadratic=True
+            ),
         ],
     )
     def test_programs_are_what_numpy_computes(self, form):
         rng = np.random.default_rng(1)
         given = Course(rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2)))
-        rows = rows_of(form, given)
+        rows = regressors_of(form, given)
         terms = Terms.of(form, rows, (2, 2))
         rows = np.ascontiguousarray(1.5 * rows)  # some of them are outside of the range
         weights = rng.normal(size=(2, terms.count))

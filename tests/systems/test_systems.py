@@ -30,7 +30,7 @@ from fmugym.pool import PoolSpec
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import (
     MASTERS,
-    Component,
+    ComponentPlan,
     Connector,
     End,
     Group,
@@ -89,7 +89,7 @@ def pendulums(master="gauss_seidel", versions=("2.0", "3.0", "2.0"), steps=(1, 2
     """Three bundled pendulums in a chain."""
     names = ("a", "b", "c")
     components = tuple(
-        Component(n, bundled_fmu("Pendulum", v), steps=m, starts=(("q_0", 0.3 * m),))
+        ComponentPlan(n, bundled_fmu("Pendulum", v), steps=m, starts=(("q_0", 0.3 * m),))
         for n, v, m in zip(names, versions, steps, strict=True)
     )
     links = (
@@ -134,7 +134,7 @@ def test_model_exchange_and_co_simulation_go_together(make, fmus, tmp_path, vers
 
 def decay_with_gain(folder, fmus, versions=(2, 1)):
     path = exchange_tools.exchange_fmu(folder / "decay.fmu", "dahlquist", versions[0])
-    decay = Component("decay", path, starts=(("k", 1.0), ("x", 1.0)))
+    decay = ComponentPlan("decay", path, starts=(("k", 1.0), ("x", 1.0)))
     gain = linear("gain", fmus[versions[1]], d=[[0.5, 0], [0, 0]])
     links = (Link("decay", "x", "gain", "u1"), Link("gain", "y1", "decay", "u"))
     return system((decay, gain), links)
@@ -252,7 +252,7 @@ def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, tmp_path):
         output=[f"{name}.theta" for name in starts],
         validate=False,
     )
-    components = [Component(n, path, starts=(("q_0", q),)) for n, q in starts.items()]
+    components = [ComponentPlan(n, path, starts=(("q_0", q),)) for n, q in starts.items()]
     plan = system(components, [Link(*link) for link in links], master="jacobi")
     rows = play(make(plan, (), [f"{n}.theta" for n in starts], time_step=0.02), 50)
     expected = np.array([found[f"{name}.theta"] for name in starts]).T
@@ -283,7 +283,7 @@ class TestValues:
     def test_types_are_converted_by_each_component(self, make, tmp_path):
         """A Real drives an Integer and a Boolean; Enumerations of FMI 2.0 and 3.0 are read."""
         probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
-        parts = tuple(Component(n, p) for n, p in zip("ab", probes, strict=True))
+        parts = tuple(ComponentPlan(n, p) for n, p in zip("ab", probes, strict=True))
         links = (Link("a", "steps", "b", "n"), Link("b", "on_out", "a", "free"))
         names = ["b.n_out", "a.free_out", "a.mode_out", "b.mode_out"]
         pool = make(system(parts, links), ["b.on", "a.mode", "b.mode"], names)

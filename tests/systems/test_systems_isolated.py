@@ -34,7 +34,7 @@ from fmugym.pool.native import NativePool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import Component as Planned
+from fmugym.systems.system_plan import ComponentPlan as Planned
 from fmugym.systems.system_plan import Connector, End, Link, Loop
 from fmugym.wine.installation import can_run_windows
 

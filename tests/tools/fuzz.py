@@ -26,7 +26,7 @@ from lxml import etree
 
 from fmugym import FMU, FMUGymError
 from fmugym.archive import fmu as fmu_module
-from fmugym.archive.bundled import BUNDLED, bundled_fmu
+from fmugym.archive.bundled import BUNDLED_FMUS, bundled_fmu
 from fmugym.config import EnvConfig
 from fmugym.task.interface import resolve
 from fmugym.task.spaces import action_space, observation_space
@@ -257,7 +257,7 @@ KINDS = ("xml", "bytes of xml", "library", "files", "zip", "bytes")
 
 def sound_fmus():
     """The files of the FMUs that are mutated, with this machine's library only."""
-    for model, version in BUNDLED:
+    for model, version in BUNDLED_FMUS:
         files = read_fmu(bundled_fmu(model, version))
         yield slim(files, library_name(int(version[0]), model))
     for version in (1, 2, 3):

@@ -25,7 +25,7 @@ import fmugym
 from fmugym.config import EnvConfig
 from fmugym.declared import format as task_format
 from fmugym.errors import shown
-from fmugym.tools.cli import _parser, main
+from fmugym.tools.cli import _parser, run_command_line
 
 LONGEST = 500
 """Characters of a message: a user reads it in a terminal."""
@@ -79,7 +79,7 @@ def on_the_command_line(*arguments: str) -> str:
     printed, error = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(error):
         try:
-            code = main(arguments)
+            code = run_command_line(arguments)
         except SystemExit as end:
             code = end.code
     assert code in {1, 2}, (arguments, code, printed.getvalue())

@@ -15,7 +15,7 @@ import fmugym
 from fmugym.declared import Task
 from fmugym.lab import ManualClock
 from fmugym.plant import connect
-from fmugym.plant.background import Background
+from fmugym.plant.background import BackgroundLoop
 from fmugym.plant.serving import _Twin
 
 HOUSE = Path(fmugym.__file__).parent / "envs" / "house.toml"
@@ -95,7 +95,7 @@ class Line:
         self.host, port = address.removeprefix("opc.tcp://").split(":")
         self.target, self.is_up, self.delay, self.sent = int(port), True, 0.0, b""
         self.ready, self.writers = threading.Event(), set()
-        self.background = Background(self.run, "line")
+        self.background = BackgroundLoop(self.run, "line")
         assert self.ready.wait(20)
 
     async def run(self):

@@ -10,7 +10,7 @@ from pool_tools import open_pool, start, step
 from fmugym import bundled_fmu
 from fmugym.systems import FMUSystem
 from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
+from fmugym.systems.system_plan import MASTERS, ComponentPlan, Evaluation, Group, Link, SystemPlan
 
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 
@@ -76,7 +76,7 @@ def linear(name, path, x0=(0.0, 0.0), steps=1, interface=None, **matrices):
         else:
             starts[letter] = matrix
     values = tuple((key, float(value)) for key, value in starts.items())
-    return Component(name, Path(path), interface, steps, values)
+    return ComponentPlan(name, Path(path), interface, steps, values)
 
 
 def system(components, links, loop=None, name="system", **options):
@@ -98,7 +98,7 @@ FRICTION = 0.004  # N m s
 
 def _pendulum(damping):
     starts = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0), ("b", damping))
-    return Component("pendulum", bundled_fmu("Pendulum"), starts=starts)
+    return ComponentPlan("pendulum", bundled_fmu("Pendulum"), starts=starts)
 
 
 def parted_pendulum(linear_path):

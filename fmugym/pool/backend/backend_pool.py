@@ -20,7 +20,7 @@ from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.backend.clocks import Clock
-from fmugym.pool.backend.pacing import Paced, Schedule
+from fmugym.pool.backend.pacing import Paced, TickSchedule
 from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
@@ -81,7 +81,7 @@ class BackendPool(CountedPool):
 
     def _set_up(self, backend: Any) -> None:
         spec, paced, count = self._spec, self._paced, self.num_instances
-        self._schedule = None if paced is None else Schedule(spec.time_step, paced.clock, count)
+        self._schedule = None if paced is None else TickSchedule(spec.time_step, paced.clock, count)
         self._rigs = [Rig(one, spec, self._now) for one in _backends(backend, count)]
         self._threads = [self._thread(index, rig) for index, rig in enumerate(self._rigs)]
         shared = backend if _makes_backends(backend) else None

@@ -1,4 +1,4 @@
-"""What FMUs say while FMPy calls them, on its way to Python's ``logging``.
+"""Messages of FMUs that FMPy calls, on their way to Python's ``logging``.
 
 The logger of FMI 1.0 and 2.0 has a variable number of arguments, which ctypes cannot make. FMPy has
 a native proxy that formats the text, but it knows one receiver per process. So there is one for all

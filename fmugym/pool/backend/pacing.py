@@ -11,7 +11,7 @@ from fmugym.checks import check_number
 from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.pool.base import FloatArray, MaskArray
 
-__all__ = ["Paced", "Schedule"]
+__all__ = ["Paced", "TickSchedule"]
 
 _TOLERANCE: Final = 0.1
 """How late a step may be without counting as a miss, in periods."""
@@ -53,7 +53,7 @@ class Paced:
         return _HOLD_AFTER * period if self.hold_after is None else self.hold_after
 
 
-class Schedule:
+class TickSchedule:
     """The ticks of N backends that are stepped together.
 
     Args:

@@ -33,7 +33,7 @@ from typing import Any, Final, NoReturn
 if sys.platform != "win32":
     import select
 
-__all__ = ["ANSWER", "LONGEST_START", "SIZE", "main"]
+__all__ = ["ANSWER", "LONGEST_START", "SIZE", "serve_parent"]
 
 ANSWER: Final = struct.Struct("<q")
 """First the process number or minus an error number, then the exit status, negative for signals."""
@@ -57,7 +57,7 @@ _LOOK: Final = 100
 """How long to wait before another look at the time, in ms."""
 
 
-def main(extension: str, descriptor: int, parent: int) -> NoReturn:
+def serve_parent(extension: str, descriptor: int, parent: int) -> NoReturn:
     """Serve the parent until it ends.
 
     Args:
@@ -315,6 +315,6 @@ def serve_alone(extension: str, size: int, parent: int) -> None:
 
 
 if __name__ == "__main__":
-    (serve_alone if sys.platform == "win32" else main)(
+    (serve_alone if sys.platform == "win32" else serve_parent)(
         sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     )

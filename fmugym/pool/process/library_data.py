@@ -1,4 +1,4 @@
-"""What a worker's memory has where its FMU's libraries keep their writable data.
+"""Writable data of an FMU's libraries in the memory of a worker.
 
 All instances of a library share these data. Data of runtime libraries that FMUs bring along do not
 count, nor does what is on the heap. It needs the maps of memory of Linux.

@@ -1,4 +1,4 @@
-"""How a worker ended, and what it prints: the parent's streams get it, and failures quote its end.
+"""Output and exit of a worker: the parent prints the output, and failures quote its end.
 
 The worker's standard output and error are pipes to the parent. The parent empties them while it
 waits for the worker, and before each request, so a step costs nothing. A worker that prints more

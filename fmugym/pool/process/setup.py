@@ -1,4 +1,4 @@
-"""What a worker is told when it starts."""
+"""Setup of a worker, which it receives when it starts."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from fmugym.pool.spec import PoolSpec
 if sys.platform == "linux":
     import fcntl
 
-__all__ = ["ECHO_SIZE", "Copies", "Memory"]
+__all__ = ["ECHO_SIZE", "BlockCopies", "Memory"]
 
 _ALIGNMENT: Final = 64
 """The alignment of each array, in bytes: a cache line."""
@@ -100,7 +100,7 @@ class Memory:
             self.descriptor = -1
 
 
-class Copies:
+class BlockCopies:
     """Copies a block of the arrays of a pool to the memory of a worker, and back.
 
     The counts are the worker's; the pool gets them when somebody asks for them.

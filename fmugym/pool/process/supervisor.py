@@ -26,7 +26,7 @@ from fmugym.pool.process.guard import LONGEST_START
 from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output, describe_exit, lines_of_echo
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Copies, Memory
+from fmugym.pool.process.shared_memory import BlockCopies, Memory
 from fmugym.pool.reports import MORE_PROCESSES, Receiver, loading_failed
 from fmugym.pool.requests import (
     Answer,
@@ -160,7 +160,7 @@ class Supervisor:
         self._setup, self._log, self._memory = setup, log, memory
         self._echo = memory.echo
         self.counts = memory.arrays.counts
-        copies = self._copies = Copies(arrays, setup.block, memory)
+        copies = self._copies = BlockCopies(arrays, setup.block, memory)
         self.take_counts = copies.take_counts
         self._read: Callable[[Reader], Any] | None = None
         self._content = b""

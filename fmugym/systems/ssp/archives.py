@@ -29,7 +29,7 @@ from fmugym.systems.ssp.elements import (
 )
 from fmugym.systems.ssp.flat import Flat
 
-__all__ = ["arguments_of"]
+__all__ = ["system_arguments"]
 
 _VERSIONS: Final = {"1.0", "2.0"}
 
@@ -37,7 +37,7 @@ _extracted: Final[dict[tuple[Path, int, int], Path]] = {}
 """Folders of the FMUs of archives by path, time and size. They are removed with the process."""
 
 
-def arguments_of(path: str | os.PathLike[str], limits: ArchiveLimits | None) -> dict[str, Any]:
+def system_arguments(path: str | os.PathLike[str], limits: ArchiveLimits | None) -> dict[str, Any]:
     """Read an SSP archive as the arguments of an ``FMUSystem``. Nothing of its FMUs is executed.
 
     Nested systems become one level: a component ``plant`` of the system ``car`` is named
@@ -46,7 +46,7 @@ def arguments_of(path: str | os.PathLike[str], limits: ArchiveLimits | None) -> 
 
     Args:
         path: The ``.ssp`` file.
-        limits: What is too large to be opened; None for the default.
+        limits: Limits of the size of an archive; None for the default.
 
     Raises:
         ConfigError: If a connection has a mistake.

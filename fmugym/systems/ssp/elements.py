@@ -1,4 +1,4 @@
-"""What a SystemStructure.ssd file says, as data."""
+"""Elements of a SystemStructure.ssd file, as data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.errors import FMULoadError, shown
 
 __all__ = [
-    "FMU_TYPE",
     "SSD",
     "Element",
     "OwnConnector",
@@ -31,7 +30,7 @@ __all__ = [
 SSD: Final = "SystemStructure.ssd"
 """The file of an archive that describes its system."""
 
-FMU_TYPE: Final = "application/x-fmu-sharedlibrary"
+_FMU_TYPE: Final = "application/x-fmu-sharedlibrary"
 
 _GIVES: Final = {"output", "calculatedParameter", "local", "constant"}
 _INTERFACES: Final = {
@@ -113,7 +112,7 @@ class Wire:
 
 @dataclass
 class SystemElement:
-    """A system and what is in it.
+    """A system and its elements.
 
     Attributes:
         name, connectors, bindings: See ``Element``.
@@ -158,7 +157,7 @@ def read_system(xml: Any, findings: list[str]) -> SystemElement:
 
     Args:
         xml: The element ``System``.
-        findings: What is ignored is added here.
+        findings: List to which ignored parts are added.
 
     Raises:
         FMULoadError: If it has something that would change results and cannot be used.
@@ -192,7 +191,7 @@ def read_system(xml: Any, findings: list[str]) -> SystemElement:
 
 
 def ignored(root: Any) -> list[str]:
-    """Say what of a file has no effect: annotations and geometry."""
+    """Describe the parts of a file that have no effect: annotations and geometry."""
     types = Counter(one.get("type") for one in root.iter("{*}Annotation"))
     shapes = Counter(one.tag.rpartition("}")[2] for one in root.iter("{*}*"))
     return [
@@ -202,11 +201,11 @@ def ignored(root: Any) -> list[str]:
 
 
 def _read_component(xml: Any, findings: list[str]) -> Element:
-    name, kind = xml.get("name"), xml.get("type") or FMU_TYPE
-    if kind != FMU_TYPE:
+    name, kind = xml.get("name"), xml.get("type") or _FMU_TYPE
+    if kind != _FMU_TYPE:
         raise FMULoadError(
             f"line {xml.sourceline}: the component {shown(name)} is of type {shown(kind)}, "
-            f"expected {FMU_TYPE!r}"
+            f"expected {_FMU_TYPE!r}"
         )
     wanted = xml.get("implementation")
     if wanted not in _INTERFACES:
@@ -255,7 +254,7 @@ def scaling_of(xml: Any) -> Conversion:
 
 
 def unit_of(xml: Any) -> str | None:
-    """The unit of a number; tools write an empty one where there is none."""
+    """Unit of a number; tools write an empty one for none."""
     return xml.get("unit") or None
 
 

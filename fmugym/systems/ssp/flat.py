@@ -1,4 +1,4 @@
-"""Nested systems made flat: which component drives which, and what starts where.
+"""Nested systems, flattened to components, connections between them and start values.
 
 A node is a connector of a component or a system, named by the path of its element and its own name.
 Connections make a forest of nodes: every node has one source at most.
@@ -19,16 +19,18 @@ from fmugym.systems.connections import Connection
 from fmugym.systems.ssp.elements import Element, OwnConnector, SystemElement, Wire
 from fmugym.systems.ssp.parameters import Setting, read_settings
 
-__all__ = ["Flat", "Node"]
+__all__ = [
+    "Flat",
+]
 
 Path = tuple[str, ...]
-Node = tuple[Path, str]
+_Node = tuple[Path, str]
 """The path of an element, () for the root system, and the name of a connector."""
 
 
 @dataclass(frozen=True)
 class _Value:
-    """A value on its way: what has become of it, and its unit; None if that is not known.
+    """A value on its way through connectors: its conversion and its unit; None if unknown.
 
     ``units`` has the definition of the unit.
     """
@@ -46,7 +48,7 @@ class Flat:
         root: The root system.
         units: The units that the file defines.
         description_of: Reads the model description of a component.
-        findings: What is ignored is added here.
+        findings: List to which ignored parts are added.
 
     Attributes:
         components: The components by path.
@@ -58,8 +60,8 @@ class Flat:
     findings: list[str]
     components: dict[Path, Element] = field(default_factory=dict)
     _systems: dict[Path, SystemElement] = field(default_factory=dict)
-    _into: dict[Node, tuple[Node, Wire]] = field(default_factory=dict)
-    _out_of: dict[Node, list[tuple[Node, Wire]]] = field(default_factory=dict)
+    _into: dict[_Node, tuple[_Node, Wire]] = field(default_factory=dict)
+    _out_of: dict[_Node, list[tuple[_Node, Wire]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._enter((), self.root)
@@ -75,7 +77,7 @@ class Flat:
             else:
                 self.components[*path, name] = element
 
-    def _variable(self, node: Node) -> Variable | None:
+    def _variable(self, node: _Node) -> Variable | None:
         """The variable of an FMU behind a node, if there is one."""
         element = self.components.get(node[0])
         if element is None:
@@ -104,7 +106,7 @@ class Flat:
 
     def _node(
         self, path: Path, system: SystemElement, end: tuple[str | None, str], wire: Wire
-    ) -> Node:
+    ) -> _Node:
         element, connector = end
         if element is None:
             if connector not in system.connectors:
@@ -119,7 +121,7 @@ class Flat:
             )
         return (*path, element), connector
 
-    def _gives(self, path: Path, node: Node) -> bool | None:
+    def _gives(self, path: Path, node: _Node) -> bool | None:
         """Whether a connector gives a value to the inside of the system at ``path``."""
         place, name = node
         element = self.components.get(place) or self._systems[place]
@@ -157,7 +159,7 @@ class Flat:
             yield _named((place, name)), self._systems[place].connectors[name]
 
     @cached_property
-    def _fans(self) -> tuple[Node, ...]:
+    def _fans(self) -> tuple[_Node, ...]:
         """The connectors of nested systems that are an input or parameter of the whole."""
         return tuple(
             node
@@ -167,7 +169,7 @@ class Flat:
             and len(list(self._reached(node, _Value()))) > 1
         )
 
-    def _nested_outputs(self) -> Iterator[Node]:
+    def _nested_outputs(self) -> Iterator[_Node]:
         """The connectors of nested systems that an output of a component leads to."""
         for node in self._into:
             if not self._can_be_named(node):
@@ -176,7 +178,7 @@ class Flat:
             if gives and self._chain(node)[0][0][0] in self.components:
                 yield node
 
-    def _can_be_named(self, node: Node) -> bool:
+    def _can_be_named(self, node: _Node) -> bool:
         """Whether a node is a connector of a nested system whose name no component has."""
         place, name = node
         nested = place != () and place in self._systems and name in self._systems[place].connectors
@@ -186,9 +188,9 @@ class Flat:
     def _names(self) -> frozenset[str]:
         return frozenset(map(".".join, self.components))
 
-    def _chain(self, target: Node) -> list[tuple[Node, Wire]]:
+    def _chain(self, target: _Node) -> list[tuple[_Node, Wire]]:
         """The ways from the first source to a node."""
-        chain: list[tuple[Node, Wire]] = []
+        chain: list[tuple[_Node, Wire]] = []
         node = target
         while node in self._into:
             chain.append(self._into[node])
@@ -197,7 +199,7 @@ class Flat:
                 raise FMULoadError(f"the connections to {_named(target)} form a circle of systems")
         return chain[::-1]
 
-    def _connection(self, target: Node, chain: list[tuple[Node, Wire]]) -> Connection:
+    def _connection(self, target: _Node, chain: list[tuple[_Node, Wire]]) -> Connection:
         first, wire = chain[0]
         ends = _named(first), _named(target)
         told = self._is_told(first) or self._is_told(target)
@@ -209,7 +211,7 @@ class Flat:
             value = self._through(value, wire.convert, wire.scaling, stop)
         return Connection(*ends, value.change.factor, value.change.offset, convert_units=False)
 
-    def _through(self, value: _Value, convert: bool, scaling: Conversion, node: Node) -> _Value:
+    def _through(self, value: _Value, convert: bool, scaling: Conversion, node: _Node) -> _Value:
         """Convert a value to the unit of a node, then scale it."""
         unit = self._unit(node)
         conversion = IDENTITY
@@ -220,8 +222,8 @@ class Flat:
         known = (value.unit, value.units) if unit is None else (unit, self._units_at(node))
         return _Value(scaling.after(conversion.after(value.change)), *known)
 
-    def _unit(self, node: Node) -> str | None:
-        """The unit of a connector; an FMU knows best what its variable has."""
+    def _unit(self, node: _Node) -> str | None:
+        """Unit of a connector; the FMU's own unit takes precedence."""
         place, name = node
         variable = self._variable(node)
         if variable is not None and variable.unit is not None:
@@ -230,12 +232,12 @@ class Flat:
         connector = element.connectors.get(name)
         return None if connector is None else connector.unit
 
-    def _is_told(self, node: Node) -> bool:
+    def _is_told(self, node: _Node) -> bool:
         """Whether a connector gives its variable the unit that the FMU does not."""
         variable = self._variable(node)
         return variable is not None and variable.unit is None and self._unit(node) is not None
 
-    def _units_at(self, node: Node) -> Mapping[str, Unit]:
+    def _units_at(self, node: _Node) -> Mapping[str, Unit]:
         element = self.components.get(node[0])
         return {**self.units, **({} if element is None else self.description_of(element).units)}
 
@@ -270,7 +272,7 @@ class Flat:
                 f"the parameter {shown(_named((path, setting.name)))} names nothing and is ignored"
             )
 
-    def _matching(self, path: Path, name: str) -> Iterator[Node]:
+    def _matching(self, path: Path, name: str) -> Iterator[_Node]:
         """The nodes that a hierarchical name may mean, seen from an element."""
         if path in self.components:
             if self._variable((path, name)) is not None:
@@ -283,7 +285,7 @@ class Flat:
             if name[:dot] in system.elements:
                 yield from self._matching((*path, name[:dot]), name[dot + 1 :])
 
-    def _ends(self, node: Node, setting: Setting) -> Iterator[tuple[Node, Any]]:
+    def _ends(self, node: _Node, setting: Setting) -> Iterator[tuple[_Node, Any]]:
         """The variables of components that get a value by a node, and their values."""
         value = setting.value
         if isinstance(value, tuple):
@@ -301,13 +303,13 @@ class Flat:
             yield end, reached.change.offset
 
     def _ends_of_array(
-        self, node: Node, setting: Setting, values: tuple[float, ...]
-    ) -> Iterator[tuple[Node, Any]]:
+        self, node: _Node, setting: Setting, values: tuple[float, ...]
+    ) -> Iterator[tuple[_Node, Any]]:
         columns = [list(self._ends(node, replace(setting, value=value))) for value in values]
         for ends in zip(*columns, strict=True):
             yield ends[0][0], [value for _, value in ends]
 
-    def _reached(self, node: Node, value: _Value) -> Iterator[tuple[Node, _Value]]:
+    def _reached(self, node: _Node, value: _Value) -> Iterator[tuple[_Node, _Value]]:
         if node[0] in self.components:
             yield node, value
             return
@@ -317,5 +319,5 @@ class Flat:
                 yield from self._reached(target, following)
 
 
-def _named(node: Node) -> str:
+def _named(node: _Node) -> str:
     return ".".join((*node[0], node[1]))

@@ -41,7 +41,7 @@ class Setting:
         name: The hierarchical name, seen from the element that has the binding.
         value: A number, a Boolean, a text, or the name of an item of an enumeration; of an array,
             a tuple of numbers or Booleans in row-major order.
-        unit: Of a real number; None if the source gives none.
+        unit: Unit of a real number; None if the source gives none.
         units: The definitions of units in the source.
         convert: Whether the value is converted to the unit of the parameter.
         scaling: Applied to the converted value.
@@ -61,7 +61,7 @@ def read_settings(xml: Any, read: Callable[[str], Any], findings: list[str]) -> 
     Args:
         xml: The element of the binding.
         read: Returns the root of another XML file of the archive by its URI.
-        findings: What is ignored is added here.
+        findings: List to which ignored parts are added.
 
     Raises:
         FMULoadError: If a source or a transformation cannot be used.

@@ -43,14 +43,14 @@ from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult, attribute, failed_in
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import hook_results
-from fmugym.vector.hooks.memory import Memory
+from fmugym.vector.hooks.memory import StepArrays
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
+from fmugym.vector.infos import copy_rows, drawn_info, late_info, observation_of, rows_not_finite
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
-    columns_of,
+    batch_columns,
+    place_batch,
     place_column,
-    place_columns,
     require_fit,
     which_of,
 )
@@ -93,7 +93,7 @@ class BatchEngine(Engine):
         self._given: dict[str, npt.NDArray[Any]] = {}
         self._strings = env.fmu.description.strings
         self._make_parameters(env.episode_start)
-        self._memory = Memory(env, env._episode, self.ended)
+        self._memory = StepArrays(env, env._episode, self.ended)
         self._prepare(task)
         self._note_foreign(slice(None), False)
 
@@ -317,7 +317,7 @@ class BatchEngine(Engine):
         return observations, self._infos(mask)
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
-        wrong = not_finite(observations)
+        wrong = rows_not_finite(observations)
         if wrong is not None and (wrong & mask).any():
             index = int(np.flatnonzero(wrong & mask)[0])
             first = shown(observation_of(observations, index))
@@ -389,7 +389,7 @@ class BatchEngine(Engine):
     def columns(self, indices: IndexArray) -> Columns:
         """See ``Engine.columns``."""
         which = which_of(indices, self._n)
-        return columns_of(self.env, which) | {
+        return batch_columns(self.env, which) | {
             "ended": np.array(self.ended[which]),
             **dict(zip(("streams", "seeds"), self._streams.taken(which), strict=True)),
         }
@@ -398,7 +398,7 @@ class BatchEngine(Engine):
         """See ``Engine.place``."""
         whence = which_of(sources, len(columns["step_count"]))
         where = which_of(indices, self._n)
-        place_columns(self.env, columns, whence, where)
+        place_batch(self.env, columns, whence, where)
         for name, values in (columns["parameters"] | columns["variables"]).items():
             if name in self._strings:
                 self._place_parameter(name, np.array(values, object)[whence], where)
@@ -530,9 +530,9 @@ class BatchEngine(Engine):
 
     def _settle(self, result: StepResult, troubled: int, started: MaskArray | None) -> None:
         """Find numbers that are not finite, and handle them and failures."""
-        rewards = not_finite(result.rewards)
+        rewards = rows_not_finite(result.rewards)
         is_told = self.env._conversions.pool_observes and not troubled
-        observations = None if is_told else not_finite(result.observations)
+        observations = None if is_told else rows_not_finite(result.observations)
         if troubled or rewards is not None or observations is not None:
             self._mend(result, started, (rewards, observations))
 
@@ -677,7 +677,7 @@ class BatchEngine(Engine):
     def _see_again(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
         """Observe environments in the state before a step, with ``done`` of their fault."""
         again = self._observe()
-        for index in _indices(not_finite(again), mask):
+        for index in _indices(rows_not_finite(again), mask):
             before = shown(observation_of(again, index))
             raise SimulationError(
                 f"environment {index}: {reasons[index]}; before it the observation is {before}"

@@ -64,7 +64,7 @@ _AT_STARTS: Final = ("_get_observation", "_get_info")
 _TOLERANCE: Final = 1e-6
 """numpy's results on arrays may differ from those on scalars in the last bit of a float32."""
 
-Kind = Literal["step", "start", "failed", "limit"]
+_Kind = Literal["step", "start", "failed", "limit"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class _Row:
         done: What ``_is_done`` has returned.
     """
 
-    kind: Kind
+    kind: _Kind
     episode: Episode
     before: dict[str, Any]
     done: bool
@@ -168,7 +168,7 @@ def _at_end(space: Any, action: Any, at_ends: bool) -> Any:
     return np.where(nearer, space.high, space.low).astype(space.dtype)
 
 
-def _row_of(env: FMUEnv, kind: Kind, before: Mapping[str, Any]) -> _Row:
+def _row_of(env: FMUEnv, kind: _Kind, before: Mapping[str, Any]) -> _Row:
     now = env._episode.copy()
     parameters = MappingProxyType(ParameterValues(now.parameters))
     variables = _variables(now.variables)

@@ -1,4 +1,4 @@
-"""What hooks return for N environments at once, checked and turned into arrays.
+"""Results of hooks for N environments at once, checked and turned into arrays.
 
 Each function raises a ``ConfigError`` that names the hook, the expected and the actual value, if
 the hook returned something else.

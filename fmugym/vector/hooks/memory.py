@@ -18,7 +18,7 @@ from fmugym.task.episode_start import Draw
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.task_programs import TaskPrograms
 
-__all__ = ["Memory"]
+__all__ = ["StepArrays"]
 
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
@@ -27,7 +27,7 @@ _KEPT_BY_THE_POOL: Final = frozenset({"previous_state", "previous_action"})
 """The quantities before the step that the pool keeps by itself, from ``kept`` and ``actions``."""
 
 
-class Memory:
+class StepArrays:
     """The arrays of N environments that compiled steps read and write in place.
 
     Args:

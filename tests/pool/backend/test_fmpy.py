@@ -15,13 +15,13 @@ from plants import PLANTS
 
 import fmugym
 from fmugym import ConfigError, FMULoadError, FMUSystem, bundled_fmu
-from fmugym.archive.bundled import BUNDLED
+from fmugym.archive.bundled import BUNDLED_FMUS
 from fmugym.pool import PoolSpec
 from fmugym.trial.opening import make_pool
 
 PENDULUM = bundled_fmu("Pendulum")
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
-bundled = pytest.mark.parametrize(("model", "version"), BUNDLED)
+bundled = pytest.mark.parametrize(("model", "version"), BUNDLED_FMUS)
 
 
 def config_of(model, **changes):

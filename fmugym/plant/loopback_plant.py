@@ -1,4 +1,4 @@
-"""A section ``[plant]`` for a task that has none: a tag for all that a plant has to tell."""
+"""Default section ``[plant]`` of a task: a server on the loopback, with a tag for each value."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SECTIONS: Final[dict[str, dict[str, Any]]] = {
 
 
 def with_plant(task: Task, protocol: str) -> Task:
-    """Give a task without ``[plant]`` one for the loopback; that of others has this protocol.
+    """Give a task a plant on the loopback if it has none, and check the protocol of its own.
 
     There are tags for the clock, the actions, the outputs that the task reads, and for its data, as
     far ahead as the agent sees them.
@@ -59,7 +59,7 @@ def _section(env: Any, protocol: str) -> dict[str, Any]:
 
 
 def _ahead(env: TaskEnv, name: str) -> dict[str, Any]:
-    """How many values of data there are, so that the agent sees far enough ahead."""
+    """Number of data values that the agent's forecasts need."""
     root = as_declared(env.task.root, env.fmu.description)[0]
     own = env.pool_spec.time_step
     steps = [one.get("step") or own for one in forecasts(root, name)]

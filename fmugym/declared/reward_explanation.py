@@ -1,4 +1,4 @@
-"""What to say of a declared reward that is not finite: the term, where it stands, its values."""
+"""Explanation of a declared reward that is not finite: its term, place and values."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from fmugym.declared.naming import Moment, Naming
-from fmugym.declared.parts import Term
+from fmugym.declared.section_entries import Term
 from fmugym.expressions.by_numpy import function_of
 from fmugym.expressions.language import CONSTANTS, Expression
 from fmugym.expressions.value import Value
@@ -48,7 +48,7 @@ def explanation(
 
 
 def _readers(term: Term, naming: Naming) -> dict[str, Callable[[Any], Any]]:
-    """Functions for the values that a term reads, by their texts."""
+    """Functions that read the values of a term, by the texts of these values."""
     names = sorted(term.expression.names - CONSTANTS.keys())
     before = sorted(term.expression.previous_names)
     return {

@@ -1,4 +1,4 @@
-"""Many controllers play the same episodes, side by side in one vector environment."""
+"""Evaluation of candidates: many controllers play the same episodes in one vector environment."""
 
 from __future__ import annotations
 
@@ -11,14 +11,23 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.baselines.controller import Controller, FloatArray
+from fmugym.baselines.controller import Controller
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.processors import available_processors
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome", "most_steps_of"]
+__all__ = [
+    "MOST_ENVS",
+    "MOST_STEPS",
+    "CandidateEvaluator",
+    "CandidateScores",
+    "CeilingError",
+    "Merit",
+    "most_steps_of",
+]
 
 MOST_ENVS: Final = 256
 """As many environments step together, unless the caller says less: more would hardly be faster."""
@@ -27,7 +36,7 @@ MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
 
 Merit = tuple[float, float]
-"""How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
+"""Merit of a candidate: minus the excess of its costs, and its mean return. More is better."""
 
 
 def most_steps_of(env: FMUEnv) -> int | None:
@@ -36,11 +45,11 @@ def most_steps_of(env: FMUEnv) -> int | None:
 
 
 class CeilingError(FMUGymError):
-    """An arena may not take more steps."""
+    """The evaluation may not take more steps."""
 
 
-class Outcome(NamedTuple):
-    """What n candidates have reached in k episodes.
+class CandidateScores(NamedTuple):
+    """Returns and costs of n candidates in k episodes.
 
     Attributes:
         returns: The total rewards, shape (n, k).
@@ -58,7 +67,7 @@ class Outcome(NamedTuple):
 
     @property
     def merits(self) -> list[Merit]:
-        """The merit of each candidate: those within the limits of all costs come first.
+        """Merit of each candidate; candidates within all cost limits come first.
 
         A fault is an excess, too, as its episode has less to pay for. NaN is an infinite one.
         """
@@ -77,7 +86,7 @@ class Outcome(NamedTuple):
 
 
 @dataclass
-class Arena:
+class CandidateEvaluator:
     """A vector environment in which candidates play the same episodes.
 
     The environments are made when they are needed, and again when more of them are. Where
@@ -89,16 +98,16 @@ class Arena:
         make_env: A function that makes the environment, or its class.
         most_envs: The largest number of environments.
         most_steps: Steps after which an episode is stopped.
-        limits: What costs may add up to in an episode, by name.
+        limits: Limits of the costs of an episode, by name.
         steps: The steps of all episodes until now.
         seconds: The real time that they have taken.
         ceiling: The largest number of steps.
         longest: The steps of the longest episode until now.
-        infos: Those of the last step.
+        infos: Infos of the last step.
         jobs: Which job each environment plays, shape (N,), before ``play`` makes a controller; -1
             for none. Job ``i * k + j`` is episode j of k of candidate i.
         advance: Is told of each step, as a part of all that ``play`` has to do.
-        backend: What steps in the place of the FMU; see ``FMUVectorEnv``.
+        backend: Backend in the place of the FMU; see ``FMUVectorEnv``.
     """
 
     make_env: Callable[[], Any]
@@ -127,13 +136,13 @@ class Arena:
         numbers: FloatArray,
         seeds: Sequence[int],
         has_moments: bool = False,
-    ) -> Outcome:
+    ) -> CandidateScores:
         """Let candidates play.
 
         Args:
             make: Makes one controller for N environments, from the numbers of each of them, shape
                 (N, k).
-            numbers: What the candidates differ in, shape (n, k).
+            numbers: Numbers of the candidates, shape (n, k).
             seeds: The seeds of their episodes.
             has_moments: Whether to add up ``moments`` of controllers, which they have after each
                 decision, shape (r, N).
@@ -157,7 +166,7 @@ class Arena:
             groups.append(totals[:, places])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
         costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
-        return Outcome(totals[0], costs, self.limits, moments)
+        return CandidateScores(totals[0], costs, self.limits, moments)
 
     def open(self, jobs: int) -> FMUVectorEnv:
         """Make the environments for so many episodes, unless there are enough.

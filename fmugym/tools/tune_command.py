@@ -1,4 +1,4 @@
-"""The command that finds the numbers of a controller: tune."""
+"""Command ``tune``: numbers of a controller."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from fmugym.baselines import Tuning, tune
-from fmugym.baselines.parsing import Search, search_of
+from fmugym.baselines.parsing import TunableController, search_of
 from fmugym.baselines.table_texts import is_table, table_in
 from fmugym.episodes.simulation import given_controller
 from fmugym.errors import ConfigError, shown
@@ -19,8 +19,8 @@ from fmugym.tools.options import (
     add_episodes,
     add_json,
     add_task,
-    check_numbers,
-    note,
+    check_counts,
+    print_note,
     require_toml,
     say_result,
     shown_in_any_case,
@@ -59,7 +59,7 @@ def add_tune(commands: Commands) -> None:
 
 
 def _tune(arguments: argparse.Namespace) -> None:
-    check_numbers(arguments, "rounds", "candidates", "episodes", "steps")
+    check_counts(arguments, "rounds", "candidates", "episodes", "steps")
     search = _search_in(arguments)
     output: Path | None = arguments.output
     if output is not None:
@@ -70,7 +70,7 @@ def _tune(arguments: argparse.Namespace) -> None:
         _search(search, arguments, found)
 
 
-def _search_in(arguments: argparse.Namespace) -> Search:
+def _search_in(arguments: argparse.Namespace) -> TunableController:
     """The controller with its ranges; its name in the task file will do, and names in a table."""
     text: str = arguments.controller
     if text.isidentifier() or is_table(text):
@@ -79,7 +79,7 @@ def _search_in(arguments: argparse.Namespace) -> Search:
     return search_of(text)
 
 
-def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
+def _search(search: TunableController, arguments: argparse.Namespace, found: list[Tuning]) -> None:
     """Search, and keep the best of each round."""
     make_env = partial(
         player_maker(arguments.task, arguments.scenario, arguments.master), physical=True
@@ -105,9 +105,9 @@ def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) 
         )
 
 
-def _show(search: Search, found: list[Tuning], arguments: argparse.Namespace) -> None:
+def _show(search: TunableController, found: list[Tuning], arguments: argparse.Namespace) -> None:
     if not found:
-        note("interrupted before the first round was over; nothing is found")
+        print_note("interrupted before the first round was over; nothing is found")
         return
     best, output = found[-1], arguments.output
     text = search.text(best.parameters)
@@ -115,7 +115,7 @@ def _show(search: Search, found: list[Tuning], arguments: argparse.Namespace) ->
         made = table_in(text) if is_table(text) else text
         write_extension(output, arguments.task, {"controllers": {arguments.name: made}})
     for name in search.at_an_end(best.parameters):
-        note(f"the best {name} is at an end of its range; a wider one may have a better one")
+        print_note(f"the best {name} is at an end of its range; a wider one may have a better one")
     facts = {"controller": text, "parameters": search.numbers(best.parameters)}
     reward = {"mean_reward": best.mean_return, "rewards_of_rounds": best.returns}
     say_result(arguments, {**facts, **reward}, text)

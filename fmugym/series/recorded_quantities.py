@@ -1,4 +1,4 @@
-"""Which values of environments a recorder writes down, and how it reads them."""
+"""Recorded quantities: the values of environments that a recorder reads and writes down."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.task.quantity import Quantities, Quantity
 from fmugym.task.roles import require_numeric
 
-__all__ = ["Choice", "Episodes", "choose", "matches", "quantities_of"]
+__all__ = ["RecordedEnvs", "RecordedQuantities", "choose", "matches", "quantities_of"]
 
 _VARYING: Final = ("continuous", "discrete")
 
 
-class Episodes(Protocol):
-    """N environments to read.
+class RecordedEnvs(Protocol):
+    """Interface of N environments that a recorder reads.
 
     Attributes:
         prototype: One of them.
@@ -44,8 +44,8 @@ class Episodes(Protocol):
         """Reads variables of the FMUs."""
 
 
-class Choice(NamedTuple):
-    """The values that a recorder writes down.
+class RecordedQuantities(NamedTuple):
+    """Quantities that a recorder writes down.
 
     Attributes:
         quantities: All of them, in the order of the columns.
@@ -61,8 +61,8 @@ class Choice(NamedTuple):
     variables: tuple[Variable, ...]
     observed: tuple[int, ...]
 
-    def present(self, episodes: Episodes, indices: Any) -> FloatArray:
-        """What M environments have at this moment, all but the observations.
+    def present(self, episodes: RecordedEnvs, indices: Any) -> FloatArray:
+        """Present values of M environments, without the observations.
 
         Args:
             episodes: All environments.
@@ -77,10 +77,10 @@ class Choice(NamedTuple):
         return np.concatenate(rows).T
 
     def seen(self, observations: Any, indices: Any) -> FloatArray:
-        """What M environments observe; nothing if observations are no arrays.
+        """Observations of M environments; no values if observations are no arrays.
 
         Args:
-            observations: Those of all environments.
+            observations: Observations of all environments.
             indices: The M environments.
 
         Returns:
@@ -100,7 +100,7 @@ def matches(pattern: str, name: str) -> bool:
     return re.fullmatch(expression, name, re.DOTALL) is not None
 
 
-def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
+def choose(env: FMUEnv, patterns: Iterable[str] | None) -> RecordedQuantities:
     """Find the values that globs name.
 
     Args:
@@ -126,7 +126,7 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
     places = tuple(i for i, one in enumerate(quantities) if one.name in wanted)
     variables = tuple(others[name] for name in others if name in wanted)
     observed = tuple(index for name, index in seen.items() if name in wanted)
-    return Choice(
+    return RecordedQuantities(
         (
             *(quantities[place] for place in places),
             *map(_of_variable, variables),
@@ -170,7 +170,7 @@ def _varies(variable: Variable) -> bool:
 
 
 def quantities_of(env: FMUEnv) -> Quantities:
-    """Everything in a task that has a name and a value: as declared, or else the config's."""
+    """Quantities of a task, or of the config if there is no task."""
     of_task = None if env.resolved is None else env.resolved.quantities
     return _of_config(env) if of_task is None else of_task()
 
@@ -204,7 +204,7 @@ def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
 
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
-    """The numbers of the FMU for which the task has no name of its own."""
+    """Numbers of the FMU for which the task has no name of its own."""
     known = {*env.interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
         if variable.is_number:

@@ -1,4 +1,4 @@
-"""How a signal ends the command line: Ctrl-C, or another one as it does, with clean-ups made.
+"""Signals that end the command line: Ctrl-C, and others that end it in the same way.
 
 By default SIGTERM (of ``kill``, ``timeout`` and batch systems) and SIGHUP (of a terminal that
 closes) end a process at once, and its temporary folders remain. Ctrl-C waits for the FMU.
@@ -32,7 +32,7 @@ class SignalledEnd(KeyboardInterrupt):
     """A signal asks the program to end.
 
     Attributes:
-        number: That of the signal.
+        number: Number of the signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -41,7 +41,7 @@ class SignalledEnd(KeyboardInterrupt):
 
 
 def end_as_after_ctrl_c() -> None:
-    """Let the signals raise ``SignalledEnd``, but for those that the process ignores (``nohup``).
+    """Let signals raise ``SignalledEnd``, except those that the process ignores (``nohup``).
 
     To be called in the main thread. While an FMU works whose code is Python, they only note that
     they shall; see ``native/python/handlers.c``.
@@ -77,7 +77,7 @@ def _watch(numbers: set[int]) -> None:
 
 
 def _end_by_force(reader: socket.socket, numbers: set[int]) -> None:
-    """Wait for one of the signals; end the process if Python has not begun to end it by then."""
+    """Wait for a signal, and end the process if Python does not begin to end it."""
     number = 0
     while number not in numbers:
         (number,) = reader.recv(1)

@@ -1,4 +1,4 @@
-"""What acts in a plant, as actions and inputs of an environment."""
+"""Actions of a plant's own controller, read as actions and inputs of an environment."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
 from fmugym.task.hooks import AssignedHook
 
-__all__ = ["Written"]
+__all__ = ["PlantActions"]
 
 
-class Written:
-    """What acts in a plant, in the place of what an environment would write.
+class PlantActions:
+    """Actions of the plant, in the place of the actions of an environment.
 
     Args:
         env: The environment. Its hook ``_get_inputs`` becomes one that reads the plant, and so do
@@ -49,7 +49,7 @@ class Written:
             warm_up.inputs = self._warm_inputs  # type: ignore[method-assign]
 
     def _warm_inputs(self, env: Any) -> FloatArray:
-        """Fill histories, before the first observation: wait, and see what has acted."""
+        """Fill histories before the first observation: wait, and read the plant's actions."""
         values = self._of_warm_up(env)
         self._feed.advance()
         return self.over(np.array([np.ravel(value)[0] for value in values]))
@@ -58,21 +58,21 @@ class Written:
         return self.over(flat_inputs(self._own(), [*self._inputs.values()], shown))
 
     def over(self, values: FloatArray) -> FloatArray:
-        """The inputs with what acts in the plant, in the FMU's units."""
+        """Replace inputs by the plant's actions, in the FMU's units."""
         acting, pairs = self._feed.row(), zip(self._inputs, values, strict=True)
         return np.array([acting.get(name, value) for name, value in pairs])
 
     def action(self) -> Any:
-        """The action that comes nearest to what acts in the plant."""
+        """Action that is closest to the plant's."""
         return self.actions.of(self._feed.row(), self._feed.time)
 
     def proposed(self, action: Any) -> dict[str, float]:
-        """What an action would write, in the task's units."""
+        """Inputs that an action would write, in the task's units."""
         values = dict(zip(self._inputs, self.actions.inputs(action), strict=True))
         return {tag.name: float(tag.of_fmu(values)) for tag in self._tags}
 
     def _range_of(self, variable: Variable) -> float:
-        """How far apart the values of an input are; refuses one that no tag tells."""
+        """Width of the range of an input; refuses an input without a tag."""
         self._feed.plant.require(variable)
         width = variable.maximum - variable.minimum
         return width if math.isfinite(width) and width > 0 else 1.0

@@ -1,4 +1,4 @@
-"""The warm-up of a declared task: controllers that act before an episode begins."""
+"""The key ``warm_up`` of a task: controllers that act before an episode begins."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from fmugym.baselines import Controller, ControllerTable, Signal
     from fmugym.baselines.law import Law
 
-__all__ = ["CLOCK", "WarmUpTable", "read_warm_up"]
+__all__ = ["WARM_UP_CLOCK", "WarmUpTable", "read_warm_up"]
 
-CLOCK: Final = "clock"
-"""What schedules of a warm-up read; it is not rounded as measured values are."""
+WARM_UP_CLOCK: Final = "clock"
+"""Name of the time that schedules of a warm-up read; it is not rounded as measured values are."""
 
-THERMOSTATS: Final = ("thermostat", "hysteresis")
+_THERMOSTATS: Final = ("thermostat", "hysteresis")
 """The names of a controller whose arguments the task may tell."""
 
 
 @dataclass(frozen=True)
 class WarmUpTable:
-    """What a task says about its warm-up.
+    """Declaration of the warm-up of a task.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         period: Its length in seconds.
         controllers: What acts on actions, by their aliases; others keep their start values. None if
             nothing acts.
@@ -49,7 +49,7 @@ class WarmUpTable:
         return [] if self.controllers is None else list(self.controllers.acting)
 
     def measured(self) -> list[str]:
-        """What the controllers measure: names and other expressions."""
+        """Names and expressions that the controllers measure."""
         return [] if self.controllers is None else self.controllers.measured()
 
 
@@ -64,7 +64,7 @@ def read_warm_up(
     Args:
         root: The task.
         actions: Its actions.
-        controlled: What is measured and its set point, in pairs, for a thermostat.
+        controlled: Pairs of a measured value and its set point, for a thermostat.
         name_of: Returns a name as it is declared.
     """
     known = root.child("controllers").items()
@@ -85,7 +85,7 @@ def read_warm_up(
             variable = _action_of(one, name, actions)
             controller: Any = (
                 _thermostat(one, variable, controlled)
-                if one.value in THERMOSTATS and one.value not in known
+                if one.value in _THERMOSTATS and one.value not in known
                 else _acting(one, known)
             )
             _rename(controller, name_of)
@@ -101,13 +101,13 @@ def read_warm_up(
 
 
 def _table(entries: Mapping[str, Any]) -> ControllerTable:
-    """The table of what acts; its schedules go by the clock."""
+    """Controllers of the warm-up as a table; their schedules go by the clock."""
     from fmugym.baselines import ControllerTable, Schedule
 
     table = ControllerTable(entries)
     for law in table.laws():
         if isinstance(law, Schedule):
-            law.clock = CLOCK
+            law.clock = WARM_UP_CLOCK
     return table
 
 
@@ -235,7 +235,7 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
 
 
 def _require_expressions(controller: Controller) -> None:
-    """Refuse what is no expression in what a controller measures."""
+    """Check that the measured values of a controller are expressions."""
     from fmugym.baselines.law import Law
 
     for signal in controller.measured() if isinstance(controller, Law) else ():

@@ -1,4 +1,4 @@
-"""Controllers that act on the variables of a task before an episode begins."""
+"""Controllers of a warm-up, which act on the variables of a task before an episode begins."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gymnasium import spaces
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.variables import TaskVariable
-from fmugym.declared.warming import CLOCK
+from fmugym.declared.warm_up_table import WARM_UP_CLOCK
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
 from fmugym.expressions.by_numpy import function_of
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = ["DeclaredWarmUp"]
 
-Hook = Callable[[Any], Any]
+_Hook = Callable[[Any], Any]
 
 
-def variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
+def _variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
     """The episode variables that nodes read."""
     rows: list[Any] = [node.what for node in nodes if node.kind == "row"]
     found = (names[0] for attribute, *names in rows if attribute == "variables")
@@ -37,7 +37,7 @@ def variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
 
 
 def _described(graph: Graph, roots: Sequence[int]) -> list[Any]:
-    """What nodes of a graph compute, in a form that is the same in every process."""
+    """Describe nodes of a graph by a text that is the same in every process."""
     order = graph.needed(roots)
     places = {number: place for place, number in enumerate(order)}
     described: list[Any] = [places[root] for root in roots]
@@ -49,7 +49,7 @@ def _described(graph: Graph, roots: Sequence[int]) -> list[Any]:
     return described
 
 
-class Pilot:
+class WarmUpControllers:
     """The controllers of a warm-up and their actions.
 
     Args:
@@ -58,7 +58,7 @@ class Pilot:
 
     Attributes:
         controllers: As given.
-        values: What they measure.
+        values: Measured values.
     """
 
     def __init__(self, naming: Naming, controllers: ControllerTable) -> None:
@@ -70,7 +70,7 @@ class Pilot:
             if variable.alias in controllers.acting
         }
         self._names = tuple(controllers.measured())
-        self._is_measured = np.array([name != CLOCK for name in self._names], dtype=bool)
+        self._is_measured = np.array([name != WARM_UP_CLOCK for name in self._names], dtype=bool)
         entry = naming.declared.warm_up.entry.child("controller")
         measured = map(Expression.parse, self._names)
         self.values = [naming.value(entry, one, Moment.SEEN).number for one in measured]
@@ -101,7 +101,7 @@ class Pilot:
         }
 
     def _rows(self, env: Any) -> Any:
-        """What is measured; controllers work with numbers of float32."""
+        """Measured values, rounded to float32 as controllers read them."""
         rows = np.empty((len(env.step_count), len(self._names)))
         for place, signal in enumerate(self._read(env)):
             rows[:, place] = signal
@@ -145,7 +145,7 @@ class DeclaredWarmUp(WarmUp):
         self,
         naming: Naming,
         inputs: Sequence[Value],
-        update: Hook,
+        update: _Hook,
         written: Mapping[str, Sequence[Value]],
         config: Mapping[str, Any],
     ) -> None:
@@ -154,12 +154,14 @@ class DeclaredWarmUp(WarmUp):
         self.caches = table.caches
         self._inputs, self._update = function_of(tuple(inputs)), update
         self.writes = tuple(written)
-        self._pilot = None if table.controllers is None else Pilot(naming, table.controllers)
-        measured = [] if self._pilot is None else self._pilot.values
+        self._controllers = (
+            None if table.controllers is None else WarmUpControllers(naming, table.controllers)
+        )
+        measured = [] if self._controllers is None else self._controllers.values
         parts = [inputs, measured, *written.values()]
         roots = [value.node for part in (*parts, [naming.clock]) for value in part]
         needed = naming.graph.needed(roots)
-        self.depends_on = variables_in([naming.graph.nodes[number] for number in needed])
+        self.depends_on = _variables_in([naming.graph.nodes[number] for number in needed])
         told = None if table.controllers is None else table.controllers.told()
         content = repr((self.steps, self._time_step, told, _described(naming.graph, roots)))
         self.digest = sha256(content.encode()).hexdigest()
@@ -170,13 +172,13 @@ class DeclaredWarmUp(WarmUp):
 
     def begin(self, count: int) -> None:
         """See ``WarmUp.begin``."""
-        if self._pilot is not None:
-            self._pilot.bind(count, self._time_step)
+        if self._controllers is not None:
+            self._controllers.bind(count, self._time_step)
 
     def inputs(self, env: Any) -> Any:
         """See ``WarmUp.inputs``; the controllers act first."""
         env.action = np.array(env.action)
-        chosen = {} if self._pilot is None else self._pilot.act(env)
+        chosen = {} if self._controllers is None else self._controllers.act(env)
         for place, value in chosen.items():
             env.action[place if env.action.ndim > 1 else ...] = value
         return self._inputs(env)

@@ -1,4 +1,4 @@
-"""Where the values of a system are: slots of inputs and outputs, and the routes between them.
+"""Memory layout of a system: slots of inputs and outputs, and the routes between them.
 
 ``fmugym.pool.form`` tells it to ``native/system_steps.c``.
 """
@@ -14,24 +14,24 @@ from typing import TypeAlias
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.systems.system_description import PartVariable, SystemDescription
-from fmugym.systems.system_plan import Component, Evaluation, Group
+from fmugym.systems.system_plan import ComponentPlan, Evaluation, Group
 
-__all__ = ["Layout", "PartLayout", "Route", "array_key"]
+__all__ = ["PartLayout", "Route", "SystemLayout", "array_key"]
 
 
 @dataclass
 class PartLayout:
-    """What a step sets and gets of one component.
+    """Inputs and outputs of one component that a step sets and gets.
 
     Attributes:
-        component: Of the plan.
-        description: Of its FMU.
+        component: Component of the plan.
+        description: Model description of its FMU.
         inputs, outputs: Its scalars and elements of arrays, one for each slot. Arrays are there as
             a whole, because FMI sets them as a whole.
         first_input, first_output: The numbers of its first slots.
     """
 
-    component: Component
+    component: ComponentPlan
     description: ModelDescription
     inputs: list[Variable] = field(default_factory=list)
     outputs: list[Variable] = field(default_factory=list)
@@ -40,7 +40,7 @@ class PartLayout:
 
     @property
     def label(self) -> str:
-        """Names it in messages."""
+        """Name in messages."""
         return f"component {self.component.name!r}"
 
     @property
@@ -50,12 +50,12 @@ class PartLayout:
 
     @cached_property
     def starts(self) -> tuple[tuple[Variable, float | str], ...]:
-        """What the plan sets before the initialization."""
+        """Start values that the plan sets before the initialization."""
         starts = self.component.starts
         return tuple((self.description.variable(name), value) for name, value in starts)
 
     def starts_of(self, variables: Iterable[Variable]) -> list[float]:
-        """What numeric scalars and elements of this component start with."""
+        """Start values of numeric scalars and elements of this component."""
         known = dict(self.component.starts)
         return [float(known.get(one.name, one.start_number)) for one in variables]
 
@@ -68,7 +68,7 @@ class Route:
         source_part, target_part: Numbers of components.
         source, target: The first slots.
         count: How many slots follow each other: several for a whole array.
-        gain, offset, link: Those of the link, and its number.
+        gain, offset, link: Gain, offset and number of the link.
     """
 
     source_part: int
@@ -81,16 +81,16 @@ class Route:
     link: int
 
 
-class Layout:
+class SystemLayout:
     """The slots and routes of a system.
 
     Args:
-        description: Of the system.
+        description: Description of the system.
         inputs: The system's variables that each step sets.
         outputs: The system's variables that are read after each step.
 
     Attributes:
-        description, plan: Of the system.
+        description, plan: Description and plan of the system.
         parts: One for each component.
         routes: In the order of their targets.
 
@@ -142,7 +142,7 @@ class Layout:
         return tuple(sorted(routes, key=lambda route: route.target))
 
     def ends_of(self, variable: Variable) -> tuple[PartVariable, ...]:
-        """What stands behind a variable of the system."""
+        """Variables of components behind a variable of the system."""
         return self.description.ends[variable.value_reference]
 
     def input_slot(self, end: PartVariable) -> int:
@@ -203,12 +203,12 @@ _Slots: TypeAlias = dict[tuple[int, *_Key], int]
 
 
 def _key(variable: Variable) -> _Key:
-    """What identifies a value of an FMU; value references of FMI 1.0 and 2.0 have a type."""
+    """Identity of a value of an FMU; value references of FMI 1.0 and 2.0 need the type."""
     return variable.value_reference, variable.kind, variable.place, variable.negated
 
 
 def array_key(end: PartVariable) -> tuple[int, int, str]:
-    """What identifies the array that an element belongs to."""
+    """Identity of the array of an element."""
     return end.part, end.variable.value_reference, end.variable.kind
 
 

@@ -1,4 +1,4 @@
-"""What the sections of a task consist of, and how it is read."""
+"""Entries of the sections of a task: memory, named expressions, rewards and costs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fmugym.expressions.language import Expression
 __all__ = [
     "Derived",
     "Limits",
-    "Memory",
+    "MemoryVariable",
     "Term",
     "read_derived",
     "read_limits",
@@ -29,10 +29,10 @@ class Term:
     """A named reward or cost.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         expression: Its value in a step.
         weight: The factor of a reward.
-        limit: What the costs of an episode may add up to; None for no limit.
+        limit: Limit of the costs of an episode; None for no limit.
     """
 
     entry: Entry
@@ -42,11 +42,11 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Memory:
-    """A value that the task itself remembers during an episode.
+class MemoryVariable:
+    """A variable that the task keeps from step to step.
 
     Attributes:
-        entry: Where it stands.
+        entry: Entry of the task.
         start: Its value at the beginning: a number or a distribution.
         update: Its value after a step; None to keep it.
         limits: For the observation space.
@@ -67,10 +67,10 @@ class Derived:
     limits: Limits
 
 
-def read_memory(entry: Entry) -> Memory:
-    """Read a value that the task remembers."""
+def read_memory(entry: Entry) -> MemoryVariable:
+    """Read an entry of ``[memory]``."""
     start = entry.required("start").value
-    return Memory(entry, start, entry.value.get("update"), read_limits(entry))
+    return MemoryVariable(entry, start, entry.value.get("update"), read_limits(entry))
 
 
 def read_derived(entry: Entry) -> Derived:
@@ -85,6 +85,6 @@ def read_term(entry: Entry) -> Term:
 
 
 def read_limits(entry: Entry, low: float = -np.inf, high: float = np.inf) -> Limits:
-    """Read ``min`` and ``max`` of a table, which may be missing, in the place of other limits."""
+    """Read ``min`` and ``max`` of a table; other limits take the place of missing ones."""
     given = entry.value or {}
     return given.get("min", low), given.get("max", high)

@@ -1,4 +1,4 @@
-"""The quantities of a declared task: everything in it that has a name and a value."""
+"""Quantities of a declared task: all of its names that have a value."""
 
 from __future__ import annotations
 

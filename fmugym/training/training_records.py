@@ -1,4 +1,4 @@
-"""What a training writes down beside the agent: recordings, the learning curve, a report."""
+"""Records of a training beside the agent: recordings, the learning curve, a report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,16 @@ from fmugym.series import RecordSeries, RecordVectorSeries
 from fmugym.series.plots import COLOURS, drawing_style
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve", "note"]
+__all__ = [
+    "CURVE",
+    "EVALUATIONS",
+    "RECORDS",
+    "REPORT",
+    "TrainingRecords",
+    "append_row",
+    "curve_of",
+    "draw_curve",
+]
 
 EVALUATIONS: Final = "evaluations.csv"
 CURVE: Final = "evaluations.png"
@@ -28,8 +37,8 @@ _FORMATS: Final = ("csv", "parquet")
 
 
 @dataclass(frozen=True)
-class Diary:
-    """What to write down of a training.
+class TrainingRecords:
+    """Settings of the records of a training.
 
     Attributes:
         variables: Globs, as of ``RecordSeries``.
@@ -52,8 +61,8 @@ class Diary:
             imported("pyarrow", "parquet")
 
     @classmethod
-    def of(cls, facts: Any) -> Diary | None:
-        """That of a training that is resumed, from its facts; None if it had none.
+    def of(cls, facts: Any) -> TrainingRecords | None:
+        """Records of a resumed training, from its facts; None if it had none.
 
         Raises:
             ConfigError: If the facts are damaged.
@@ -71,10 +80,10 @@ class Diary:
         return asdict(self)
 
     def of_training(self, folder: Path, begin: int) -> Callable[[FMUVectorEnv], Any]:
-        """What wraps the environments of the training.
+        """Make the wrapper of the training's environments.
 
         Args:
-            folder: That of the training. The file is made in the first step.
+            folder: Folder of the training. The file is made in the first step.
             begin: The steps that were done before.
         """
         name = f"training_from_{begin}" if begin else "training"
@@ -90,7 +99,7 @@ class Diary:
         return wrap
 
     def of_evaluation(self, folder: Path, steps: int, name: str) -> Callable[[FMUEnv], Any]:
-        """What wraps the environment of an evaluation after some steps; a file is replaced."""
+        """Make the wrapper of an evaluation's environment; its file is replaced."""
         safe = re.sub(r"[^\w.-]+", "_", name)
         path = folder / RECORDS / f"evaluation-{steps}-{safe}.{self.format}"
 
@@ -101,14 +110,16 @@ class Diary:
         return wrap
 
 
-def note(folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVALUATIONS) -> None:
+def append_row(
+    folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVALUATIONS
+) -> None:
     """Add a row to a table of a training, which is made if there is none.
 
     Args:
-        folder: That of the training.
-        names: Those of the columns; in ``evaluations.csv`` steps and mean reward are the first.
+        folder: Folder of the training.
+        names: Names of the columns; in ``evaluations.csv`` steps and mean reward are the first.
         row: The values.
-        name: That of the file.
+        name: Name of the file.
     """
     path = folder / name
     before = path.read_text(encoding="utf-8") if path.exists() else ""
@@ -121,14 +132,14 @@ def note(folder: Path, names: Sequence[str], row: Sequence[Any], name: str = EVA
 
 
 def curve_of(folder: Path) -> Mapping[str, list[float]]:
-    """The columns of ``evaluations.csv``: steps, mean reward, and that of each scenario."""
+    """Columns of ``evaluations.csv``: steps, mean reward, and the mean of each scenario."""
     with (folder / EVALUATIONS).open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return {name: [float(row[name]) for row in rows] for name in rows[0]}
 
 
 def _limits(curves: Iterable[Sequence[float]]) -> tuple[float, float]:
-    """Those of the axis of rewards: the first quarter of a training may leave them."""
+    """Limits of the axis of rewards, which the first quarter of a training may leave."""
     shown = [value for curve in curves for value in curve[len(curve) // 4 :]]
     margin = 0.08 * (max(shown) - min(shown)) or 1.0
     return min(shown) - margin, max(shown) + margin

@@ -1,4 +1,4 @@
-"""Who takes part in a search: controllers with numbers to be found, and classes of policies."""
+"""Search of one class of candidates: numbers of a controller, or weights of a network."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, Merit
-from fmugym.baselines.controller import FloatArray
+from fmugym.baselines.candidate_evaluation import CandidateEvaluator, Merit
+from fmugym.pool.base import FloatArray
 
-__all__ = ["NO_MERIT", "Entrant"]
+__all__ = ["NO_MERIT", "CandidateSearch"]
 
 NO_MERIT: Final[Merit] = (-math.inf, -math.inf)
 
@@ -26,18 +26,18 @@ if few rounds counted."""
 
 
 @dataclass
-class Entrant:
-    """One search, and what has come of it.
+class CandidateSearch:
+    """A search for the numbers of one class of candidates, and its best results.
 
     Attributes:
         cma: The search, a ``CMA``; None for a controller whose numbers are known.
         make: Makes a controller for N environments from their numbers, shape (N, n). For
             validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.
-        then: What enters when this one gains nothing; None for nothing.
+        then: Class of candidates that enters when this one gains nothing; None for nothing.
         first: The candidates of the first round, shape (n, k); ``cma`` goes on from the best of
             them. None if ``cma`` draws them.
-        rounds: How many it has had.
+        rounds: Number of its rounds.
         leader: The numbers of the best candidate since the last validation, shape (n,).
         lead: Its merit.
         best: The agent with the best numbers in validation; None before the first one.
@@ -63,14 +63,14 @@ class Entrant:
     agreement: float = 1.0
     last_round: int = 0
 
-    def play(self, arena: Arena, seeds: Sequence[int]) -> Merit:
+    def play(self, evaluator: CandidateEvaluator, seeds: Sequence[int]) -> Merit:
         """Do a round, and return the merit of its best candidate.
 
         Ranks decide, so that the scale of rewards does not matter.
         """
         first, self.first = self.first, None
         found = self.cma.ask() if first is None else first
-        outcome = arena.play(self.make, found, seeds)
+        outcome = evaluator.play(self.make, found, seeds)
         best = outcome.order[0]
         if first is None:
             self.cma.tell(np.array(outcome.order))
@@ -84,7 +84,7 @@ class Entrant:
         return reached
 
     def _note_agreement(self, returns: FloatArray) -> None:
-        """Take twice as many episodes where chance decides on the order of candidates.
+        """Double the number of episodes if chance decides on the order of candidates.
 
         That is so if the ranks by two halves of the episodes hardly correlate, in the mean of some
         rounds.
@@ -105,13 +105,13 @@ class Entrant:
         if 1 < self.episodes < _MOST_EPISODES:
             self.episodes *= 2
 
-    def validate(self, arena: Arena, seeds: Sequence[int]) -> None:
+    def validate(self, evaluator: CandidateEvaluator, seeds: Sequence[int]) -> None:
         """Let the mean of the search and the leader play; the better one is kept if it is the best.
 
         The search goes on from the leader if that is better: where most candidates reach the same,
         their mean does not come near the few that reach more.
         """
-        merits = arena.play(self.make, np.stack([self.cma.mean, self.leader]), seeds).merits
+        merits = evaluator.play(self.make, np.stack([self.cma.mean, self.leader]), seeds).merits
         if merits[1] > merits[0]:
             self.cma.mean = self.leader
         if not max(merits) <= self.merit:
