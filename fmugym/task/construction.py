@@ -52,7 +52,22 @@ _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Constructed(Pictured):
-    """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs."""
+    """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs.
+
+    Attributes:
+        interface: The variables of the config, as the FMU has them.
+        pool_spec: The work of the pool at each reset and step: step sizes, variables, solver.
+        pool_opening: Opens pools for this environment.
+        pool: The pool that has the FMU.
+        episode_start: The values with which episodes start, constant or drawn.
+        formulas: The expressions of the task as values of a graph; None without expressions.
+        resolved: The task file, resolved (``TaskEnv``); None for other tasks.
+        step_limit: The number of steps after which an episode is truncated.
+        warm_up: The warm-up with moving inputs; None if there is none.
+        warm_up_steps: The steps of a warm-up.
+        planning_model: Makes an environment to plan with, where a plant stands in for the FMU; or
+            None.
+    """
 
     fmi_version: ClassVar[int | None]
     fmi_interface: ClassVar[str | None]
