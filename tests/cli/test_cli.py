@@ -413,7 +413,7 @@ class TestNew:
         assert code == 0
         assert [f"# p{n} = {n}.0" in out for n in (39, 40)] == [True, False]
         assert "# 7 more are listed by: fmugym info" in out
-        assert "7 parameters are left out; 'fmugym info' lists them" in err
+        assert "7 parameters are left out; 'fmugym info -v' lists them" in err
 
     def test_locals_that_look_like_results_are_listed(self, make_fmu, ran):
         """As comments: each is a line of [variables] once its # is gone."""
