@@ -24,7 +24,7 @@ import fmugym
 from fmugym.envs import CartPoleEnv
 from fmugym.vector.making import make_with_pool
 
-__all__ = ["median_time", "tables"]
+__all__ = ["tables"]
 
 CALLS = 2000
 """Calls in a row, before the turn of the other configuration."""

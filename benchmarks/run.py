@@ -1,4 +1,4 @@
-"""Measure everything that the project says about speed and memory, side by side in one run.
+"""Measure all figures of speed and memory in the README and docs/, side by side in one run.
 
     python benchmarks/run.py
     python benchmarks/run.py --quick --only single
@@ -27,18 +27,14 @@ import arrays
 import exchange
 import heavy
 import isolation
-import loaded
 import memory
 import overlap
 import planning
-import reset
-import rollouts
 import single
 import systems
 import tasks
 import training
 import vector
-import windows
 from documents import DOCUMENTS
 from measure import Effort, processors
 from tables import Table
@@ -48,23 +44,17 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "vector": vector.tables,
     "arrays": arrays.tables,
     "tasks": tasks.tables,
-    "reset": reset.tables,
-    "rollouts": rollouts.tables,
     "heavy": heavy.tables,
     "exchange": exchange.tables,
     "systems": systems.tables,
     "isolation": isolation.tables,
-    "windows": windows.tables,
     "overlap": overlap.tables,
     "training": training.tables,
     "planning": planning.tables,
     "memory": memory.tables,
-    "loaded": loaded.tables,
 }
 FULL = Effort(rounds=11, seconds=0.08, quick=False)
 QUICK = Effort(rounds=1, seconds=0.01, quick=True)
-LOADED = Effort(rounds=21, seconds=0.2, quick=False)
-"""Longer turns, because the system assigns processors in slices of some milliseconds."""
 
 
 def main() -> None:
@@ -74,7 +64,7 @@ def main() -> None:
     begin, results = time.perf_counter(), {}
     print(f"{_machine()}\n", flush=True)
     for name, measure in _chosen(arguments.only or [], arguments.table or []).items():
-        results[name] = measure(_effort(name, arguments.quick))
+        results[name] = measure(QUICK if arguments.quick else FULL)
         for table in results[name]:
             print(f"{table}\n", flush=True)
     print(f"{time.perf_counter() - begin:.0f} s; {_load()}")
@@ -103,12 +93,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     return parser
-
-
-def _effort(section: str, quick: bool) -> Effort:
-    if quick:
-        return QUICK
-    return LOADED if section == "loaded" else FULL
 
 
 def _machine() -> str:

@@ -185,7 +185,7 @@ _NOT_NEGATIVE: Final = Kind(partial(check_number, minimum=0), {"type": "number",
 
 @dataclass(frozen=True)
 class Foreign(KnownArguments):
-    """Settings for an FMU of unknown quality; see ``docs/foreign.md`` for the keys.
+    """How an FMU of unknown quality is opened and run; see ``docs/config.md`` for the keys.
 
     Raises:
         ConfigError: For values of the wrong type or range; it names all of them.
@@ -288,8 +288,8 @@ class EnvConfig:
     )
     start_time: Any = key(
         Kind(_start_time, {"title": "number, distribution, list of numbers"}),
-        "First communication point of an episode in seconds, or [what it is drawn "
-        "from](config.md#step-sizes-and-times) at each reset.",
+        "First communication point of an episode in seconds, or a distribution or list from which "
+        "each reset [draws](config.md#step-sizes-and-times) one.",
         None,
         "the default of the FMU",
     )
@@ -301,7 +301,7 @@ class EnvConfig:
         "Tolerance of the FMU's solver, or of [fmugym's](fmi.md#choose-a-solver) in "
         "model exchange.",
         None,
-        "that of the FMU's default experiment",
+        "from the FMU's default experiment",
     )
     substeps: int = key(COUNT, "Number of communication steps in one step.", 1)
     warm_up: float = key(
@@ -374,11 +374,14 @@ class EnvConfig:
     )
     units: Mapping[str, str] = key(
         Entries(TEXT),
-        "Units of the FMU's variables by name, for those to which the FMU gives none or a wrong "
-        "one.",
+        "Units of the FMU's variables by name, where the FMU declares none or a wrong one.",
         {},
     )
-    on_fault: str = key(option(*ON_FAULT), "What a failed step does.", "truncate")
+    on_fault: str = key(
+        option(*ON_FAULT),
+        "The [consequence](config.md#what-a-failed-step-does) of a failed step.",
+        "truncate",
+    )
     fault_retries: int = key(
         Kind(
             partial(check_integer, minimum=0, maximum=_MOST_RETRIES),
@@ -398,15 +401,16 @@ class EnvConfig:
     )
     foreign: Foreign = key(
         FOREIGN,
-        "[Keys for experts](foreign.md): trials, time limits, licences, leaks, libraries.",
+        "[Keys for experts](config.md#keys-for-experts): trials, time limits, licences, leaks, "
+        "libraries.",
         Foreign(),
-        "see its page",
+        "see below",
     )
     samplings: Mapping[str, str] = key(
         Entries(option(*SAMPLINGS)),
-        'What a step gives of outputs and monitored variables by name: `"last"`, or the `"mean"`, '
-        '`"integral"` over time, `"min"` or `"max"` of the values after each substep. After a '
-        "reset an integral is 0.",
+        "How a step makes one value of those after its substeps, by output or monitored variable: "
+        '`"last"`, `"mean"`, `"integral"` over time, `"min"` or `"max"`. After a reset an integral '
+        "is 0.",
         {},
     )
     interface: str | None = key(

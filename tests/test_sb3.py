@@ -5,7 +5,6 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from example_tools import run_example
 from gymnasium import spaces
 
 import fmugym
@@ -16,7 +15,6 @@ sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3"
 # ruff: noqa: E402  (what follows needs SB3)
 
 import torch
-from PIL import Image
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -400,32 +398,6 @@ def test_a_model_is_saved_loaded_and_goes_on(make, tmp_path):
     loaded = sb3.PPO.load(tmp_path / "model", env=make(), device="cpu")
     assert_same(weights(loaded), weights(model))
     assert loaded.learn(96, reset_num_timesteps=False).num_timesteps == 192
-
-
-@pytest.fixture(scope="module", name="quick")
-def fixture_quick(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("quick")
-    options = "--quick", "--steps", "1600", "--seeds", "1"
-    return folder, run_example("train_sb3.py", *options, folder=folder, warnings="default")
-
-
-def test_the_example_ends_well_and_writes_one_picture(quick):
-    folder, _ = quick
-    files = [path.relative_to(folder).as_posix() for path in folder.rglob("*.*")]
-    assert files == ["results/sb3_learning_curves.png"]
-    with Image.open(folder / files[0]) as picture:
-        assert picture.width > 1000
-        seen = {colour for _, colour in picture.convert("RGB").getcolors(1 << 20)}
-    assert {(0x00, 0x72, 0xB2), (0xE6, 0x9F, 0x00)} <= seen
-
-
-def test_the_examples_policies_score_the_same_on_both_sides(quick):
-    rows = [line for line in quick[1].splitlines() if line.startswith(("│ FMU", "│ Gym"))]
-    assert len(rows) == 4
-    for row in rows:
-        _, on_fmu, on_gymnasium, _, same, *_ = (cell.strip() for cell in row.strip("│").split("│"))
-        assert on_fmu == on_gymnasium
-        assert same == "20/20"
 
 
 @pytest.mark.parametrize("env", [None, 3, "nothing/Nothing-v0", "no_module:No-v0", "a b"])

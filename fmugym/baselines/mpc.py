@@ -193,8 +193,8 @@ class MPC(Controller):
         if self._surrogate is None or self._surrogate[0] != scope:
             found, _ = fitted_surrogate(make, self.steps, self.seed)
             env.logger.info(
-                "%s plans on a surrogate of %d steps: %s; simulations are wrong by %.2g %% of what "
-                "outputs vary",
+                "%s plans on a surrogate of %d steps: %s; errors of simulations are %.2g %% of the "
+                "variation of outputs",
                 type(self).__name__,
                 self.steps,
                 found.terms.form,

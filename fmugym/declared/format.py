@@ -332,12 +332,12 @@ DEVICE: Final = {
                     "That there is no new value in a step.",
                     REQUIRED,
                 ),
-                "value": Key(FINITE, "What comes instead.", None, "the value before"),
+                "value": Key(FINITE, "The value of such a step.", None, "the value before"),
             },
             short="probability",
         ),
-        "The probability that there is no new value in a step, and the one before holds. With "
-        "`{ probability = 0.1, value = -40 }`, this number comes instead.",
+        "The probability that a step brings no new value. The value before then holds, or, with "
+        "`{ probability = 0.1, value = -40 }`, the value is -40.",
     ),
 }
 """The keys of sensors and actuators, in the order in which they take effect."""
@@ -354,8 +354,8 @@ VARIABLE: Final = Table(
         ),
         "fmu_unit": Key(
             TEXT,
-            "Unit that the FMU [means](task-file.md#units), for one that does not say it or says "
-            "a wrong one.",
+            "The unit in which the FMU [computes](task-file.md#units), where the FMU declares none "
+            "or a wrong one.",
             None,
             "the FMU's",
         ),
@@ -376,10 +376,10 @@ VARIABLE: Final = Table(
         ),
         "levels": Key(
             Kind(_levels, _NUMBERS),
-            "The values that an action chooses from; of an Enumeration, values of its items. If "
-            "all actions have some, the agent's action space is `Discrete` or `MultiDiscrete`. "
-            "Beside an action without, such a one is a number, whose range has equal parts, one "
-            "for each level in ascending order. "
+            "The values from which an action chooses; of an Enumeration, the values of its items. "
+            "If all actions have levels, the action space is `Discrete` or `MultiDiscrete`. If "
+            "some have none, the space is a `Box`, in which equal parts of the range stand for "
+            "the levels in ascending order. "
             "[Controllers](task-file.md#what-controllers-see-and-write) write values.",
         ),
         "delta": Key(
@@ -389,14 +389,14 @@ VARIABLE: Final = Table(
         ),
         "min_on": Key(
             POSITIVE_TIME,
-            "The shortest time for which an action stays on (other than 0). Until then the old "
-            "value stays.",
+            "The least time for which an action stays on, at a value other than 0. Within this "
+            "time, the old value stays.",
         ),
-        "min_off": Key(POSITIVE_TIME, "The time that an action stays off at least."),
+        "min_off": Key(POSITIVE_TIME, "The least time for which an action stays off."),
         "sample": Key(
             option(*SAMPLINGS),
-            "What a step gives of the values after each substep. The unit of an integral is that "
-            'of the variable times seconds: `"kWh"` for W.',
+            "How a step makes one value of those after its substeps. The unit of an integral is "
+            'the unit of the variable times seconds: `"kWh"` for W.',
             "last",
         ),
         **DEVICE,
@@ -458,8 +458,8 @@ AGENT: Final = Table(
         "history": Key(
             HISTORY,
             '`{ of = ["T", "u"], length = "2h" }`: the values of variables, actions, data and '
-            "schedules before the present one, the latest first. That of an action begins with the "
-            "last action.",
+            "schedules before the present one, the latest first. The history of an action begins "
+            "with the last action.",
         ),
         "rescale": Key(FLAG, "Whether actions go from -1 to 1 for `min` to `max`.", False),
         "normalize": Key(
@@ -488,8 +488,8 @@ DATA: Final = Table(
         ),
         "draw": Key(
             option("shared", "own"),
-            "Of several files, an episode draws those of one place in all lists, or this one by "
-            'itself: `"own"`.',
+            'How an episode chooses one of several files. `"shared"`: the same place in all lists '
+            'of files. `"own"`: a place drawn for this list alone.',
             "shared",
         ),
         "column": Key(
@@ -531,8 +531,9 @@ DATA: Final = Table(
             TIME,
             "Time after which the rows repeat.",
             None,
-            "one more row than there are; [weather](task-file.md#weather): whole days; "
-            "[Modelica](task-file.md#tables-of-modelica): from the first to the last row",
+            "the first row follows one row distance after the last; [weather](task-file.md#weather)"
+            ": whole days; [Modelica](task-file.md#tables-of-modelica): from the first to the last "
+            "row",
         ),
         "interpolation": Key(
             option("linear", "previous"),
@@ -552,8 +553,8 @@ DATA: Final = Table(
             "An input of the FMU that is set to the value at the beginning of each step, in its "
             "own unit.",
         ),
-        "min": Key(NUMERIC, _LIMITS["min"].text, None, "that of the values"),
-        "max": Key(NUMERIC, _LIMITS["max"].text, None, "that of the values"),
+        "min": Key(NUMERIC, _LIMITS["min"].text, None, "the smallest value"),
+        "max": Key(NUMERIC, _LIMITS["max"].text, None, "the largest value"),
     }
 )
 
@@ -604,7 +605,10 @@ SETPOINT: Final = Table(
             "the reset.",
         ),
         "data": Key(TEXT, '`"profile"`: the values of data with this name, or of an expression.'),
-        "of": Key(TEXT, "What the set point is for; this makes the name of its deviation."),
+        "of": Key(
+            TEXT,
+            "The variable of the set point, which gets a [deviation](task-file.md#set-points).",
+        ),
         **_LIMITS,
     },
     short="value",
@@ -651,7 +655,7 @@ SCENARIO: Final = Table(
 
 SIGNAL: Final = Table(
     {
-        "controller": Key(TEXT, "What gives the signal.", REQUIRED),
+        "controller": Key(TEXT, "The controller whose action is the signal.", REQUIRED),
         "min": Key(NUMERIC, "Its lowest value.", REQUIRED),
         "max": Key(NUMERIC, "Its highest value.", REQUIRED),
     },
@@ -694,7 +698,7 @@ NAMED: Final = _named(**_LIMITS)
 
 REWARD: Final = _named(weight=Key(FINITE, "Factor of the reward.", 1.0))
 
-COST: Final = _named(limit=Key(NUMERIC, "What the costs of an episode may add up to."))
+COST: Final = _named(limit=Key(NUMERIC, "The largest sum of this cost in an episode."))
 
 MEMORY: Final = Table(
     {
@@ -754,15 +758,15 @@ _ADDRESSES: Final = {
         "Modbus: whether the first register is the most significant.",
         "big",
     ),
-    "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", None, "that of the plant"),
-    "scale": Key(NUMERIC, "What the plant's number is multiplied by.", 1.0),
-    "offset": Key(NUMERIC, "What is added then.", 0.0),
+    "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", None, "the plant's"),
+    "scale": Key(NUMERIC, "The factor by which the plant's number is multiplied.", 1.0),
+    "offset": Key(NUMERIC, "The number that is added after that.", 0.0),
 }
 
 TAG: Final = Table(
     {
         **_ADDRESSES,
-        "unit": Key(TEXT, "The unit of the result.", None, "that of the task"),
+        "unit": Key(TEXT, "The unit of the result.", None, "the task's"),
     },
     short="node",
     one_of=("node", "register"),
@@ -777,8 +781,8 @@ LIVE: Final = Table(
         **_ADDRESSES,
         "count": Key(
             _COUNT,
-            "How many values a tag has: those of now, and of each `step` ahead. One value alone "
-            "holds.",
+            "How many values a tag has: the present one, then one for each `step` ahead. If there "
+            "is only one, it holds for all times ahead.",
             1,
         ),
     },
@@ -793,7 +797,7 @@ PLANT: Final = Table(
         "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", 1),
         "tags": Key(
             Entries(TAG),
-            "By variable, where it is: all that the task reads of the FMU, and the actions.",
+            "The tag of each variable that the task reads of the FMU, and of each action, by name.",
             REQUIRED,
         ),
         "clock": Key(
@@ -806,13 +810,15 @@ PLANT: Final = Table(
         "poll": Key(POSITIVE_TIME, "Time from one reading to the next.", None, "a tenth of a step"),
         "stale_after": Key(
             POSITIVE_TIME,
-            "A good value that was asked for longer ago than this is stale: the last one holds.",
+            "The age from which a value counts as missing. The age is the time since the request "
+            "that brought the value.",
             None,
             "three polls",
         ),
         "hold": Key(
             TIME,
-            "How long it holds for an agent, which holds its last action after that.",
+            "How long an agent goes on with the last good value where one is missing. After that "
+            "it repeats its last action.",
             None,
             "a step",
         ),
@@ -821,8 +827,9 @@ PLANT: Final = Table(
         ),
         "data": Key(
             Entries(LIVE),
-            "By name, where the data that the agent sees come from: a file that something else "
-            "refreshes (keys as in `data`, times in seconds of the year or dates), or a tag.",
+            "The live source of each series of data that the agent sees, by name: a tag, or a file "
+            "that another program refreshes (keys as in `data`; times are dates, or seconds of the "
+            "year).",
         ),
         "encryption": Key(FLAG, "OPC UA: whether messages are signed and encrypted.", True),
         "certificate": Key(PATH, "OPC UA: this client's certificate."),
@@ -944,8 +951,8 @@ TASK: Final = Table(
         ),
         "warm_up": Key(
             WARM_UP,
-            "Time simulated before the first observation, or a table that says [what acts in "
-            "it](task-file.md#warm-up).",
+            "Time simulated before the first observation, or a table that also names the "
+            "[controller](task-file.md#warm-up) of this time.",
             None,
             "`0`",
         ),
@@ -963,8 +970,8 @@ TASK: Final = Table(
         ),
         "file": Key(
             NAMES,
-            "The files of data that all episodes take, of [several](task-file.md#several-files), "
-            "by name.",
+            "The files that all episodes take where the data have "
+            "[several](task-file.md#several-files), by name.",
             None,
             "drawn",
         ),
@@ -973,7 +980,7 @@ TASK: Final = Table(
             "The [standard time](task-file.md#time-zones-and-leap-years) of the clock: an offset "
             'from UTC such as `"+01:00"`, or a zone, whose winter time it is.',
             None,
-            "that of the weather file, or else the smallest offset in the data",
+            "the offset of the weather file, or else the smallest one in the data",
         ),
         "scenarios": Key(
             Entries(SCENARIO, _MOST_NAMES), "[Scenarios](task-file.md#clock-and-scenarios) by name."
@@ -988,8 +995,8 @@ TASK: Final = Table(
         ),
         "fitted": Key(
             PATH,
-            "[What a fit to logs has found](fit.md): a file of `fmugym fit`, of which each episode "
-            "draws a row. Its parameters take the place of those in `parameters`.",
+            "The file of [`fmugym fit`](fit.md), from which each episode draws a row of "
+            "parameters. These win over `parameters`.",
         ),
         "data": Key(
             Entries(DATA, _MOST_NAMES),
@@ -1001,8 +1008,8 @@ TASK: Final = Table(
         ),
         "controllers": Key(
             Entries(Either(Entries(Either(SIGNAL, CONTROLLER)), CONTROLLER), _MOST_NAMES),
-            "[Controllers](task-file.md#controllers) by name: what agents are compared with, for "
-            "the warm-up, and for `--controller` on the command line.",
+            "[Controllers](task-file.md#controllers) by name, for comparison with agents, for the "
+            "warm-up, and for `--controller` on the command line.",
         ),
         "inputs": Key(
             Entries(EXPRESSION, _MOST_NAMES),
@@ -1019,7 +1026,8 @@ TASK: Final = Table(
         ),
         "agent": Key(
             AGENT,
-            "What the [agent](task-file.md#agent) does and sees. Required unless there is a class.",
+            "Actions and observations of the [agent](task-file.md#agent). Required unless there is "
+            "a class.",
         ),
         "reward": Key(
             Either(Entries(REWARD, _MOST_NAMES), EXPRESSION),
@@ -1040,11 +1048,11 @@ TASK: Final = Table(
         ),
         "plant": Key(
             PLANT,
-            "[Where a plant has the variables](plant.md), for `simulate --plant` and `serve`.",
+            "The [plant's address and tags](plant.md), for `simulate --plant` and `serve`.",
         ),
         "foreign": Key(
             _taking_expressions(Table(FOREIGN.keys)),
-            "[Keys for experts](foreign.md), about FMUs of unknown quality.",
+            "[Keys for experts](config.md#keys-for-experts), about FMUs of unknown quality.",
         ),
         "config": Key(
             CONFIG_OF_TASK, "More keys of the [config](config.md#config-keys), such as `on_fault`."

@@ -30,12 +30,12 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
 ``--steps N``. All commands take ``--json``, ``-q`` and ``-v``; those that write files ``--force``.
 
-``info`` and ``new`` execute nothing of the FMU, the others do. Output is printable text; letters
-that the console lacks are escaped. The exit code is 0; 1 if something cannot be used (the error
-stream says why), ``validate`` finds an error, ``simulate`` meets a reward that is no finite number,
-or ``evaluate`` or ``simulate`` leave one out; 2 if the arguments are wrong; 130 after Ctrl-C, which
-keeps what was written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143
-or 129.
+``info`` and ``new --class`` execute nothing of the FMU, the others do. Output is printable text;
+letters that the console lacks are escaped. The exit code is 0; 1 if something cannot be used (the
+error stream says why), ``validate`` finds an error, ``simulate`` meets a reward that is no finite
+number, or ``evaluate`` or ``simulate`` leave one out; 2 if the arguments are wrong; 130 after
+Ctrl-C, which keeps what was written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code
+is then 143 or 129.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.

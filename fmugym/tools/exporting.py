@@ -164,8 +164,8 @@ def _surrogate(arguments: argparse.Namespace) -> ExportedAgent:
         with replaced(arguments.plot) as part:
             plot_prediction(predicted(found, unseen), found).savefig(part)
     tell(
-        f"surrogate of {arguments.steps} steps: {found.terms.form}; simulations are wrong by "
-        f"{100 * found.error:.2g} % of what outputs vary"
+        f"surrogate of {arguments.steps} steps: {found.terms.form}; errors of "
+        f"simulations are {100 * found.error:.2g} % of the variation of outputs"
     )
     return agent_of_surrogate(found, arguments.output.stem, units)
 

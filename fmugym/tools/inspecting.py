@@ -107,7 +107,9 @@ def _info(arguments: argparse.Namespace) -> None:
     if arguments.json:
         say_json(facts)
     else:
-        say("\n".join([as_lines(facts), *data_as_text(facts.get("data", _NO_DATA))]))
+        is_short = not (arguments.verbose or arguments.all or arguments.filter)
+        text = as_lines(facts, is_short=is_short)
+        say("\n".join([text, *data_as_text(facts.get("data", _NO_DATA))]))
 
 
 def _repair(arguments: argparse.Namespace, fmu: FMU) -> None:

@@ -204,9 +204,11 @@ def _search(arguments: argparse.Namespace) -> None:
         _tell_faults(
             {name: one["mean_costs"]["failed episodes"] for name, one in facts["test"].items()}
         )
-        options = f"; --rounds {facts['rounds']} repeats the search"
+        if facts["controller"]:
+            tell(f"its controller: {facts['controller']}")
+        options = f"; to repeat the search: --rounds {facts['rounds']}"
         is_repeated = facts["rounds"] and "surrogate" not in facts
-        tell(f"{arguments.output} has the agent{options if is_repeated else ''}")
+        tell(f"the agent is in {arguments.output}{options if is_repeated else ''}")
 
 
 def _tell_faults(parts: Mapping[str, float]) -> None:

@@ -136,7 +136,10 @@ def add_common(command: argparse.ArgumentParser) -> None:
     group = command.add_mutually_exclusive_group()
     group.add_argument("-q", "--quiet", action="store_true", help="print results and errors only")
     group.add_argument(
-        "-v", "--verbose", action="store_true", help="show the log, and what FMUs print"
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="show the log, and what FMUs print; with info: all parameters and findings",
     )
     files = [one.dest for one in command._actions if one.dest in _FILES]
     command.set_defaults(files=files)

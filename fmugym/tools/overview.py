@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -35,7 +35,9 @@ _HEADINGS: Final = {
 }
 _COLUMNS: Final = ("name", "type", "unit", "range", "start", "variability", "description")
 _WIDEST: Final = 44
-_MOST_FINDINGS: Final = 100
+_MOST_PARAMETERS: Final = 20
+_MOST_FINDINGS: Final = 10
+"""They leave the overview on one page."""
 
 
 def overview(fmu: FMU, *, everything: bool = False, pattern: str | None = None) -> dict[str, Any]:
@@ -159,26 +161,31 @@ def typed_start(variable: Variable) -> bool | int | float | str | None:
         return text
 
 
-def as_text(facts: Mapping[str, Any]) -> str:
+def as_text(facts: Mapping[str, Any], *, is_short: bool = True) -> str:
     """Format an overview for a terminal.
 
     Args:
-        facts: Result of ``overview``.
+        facts: The result of ``overview``.
+        is_short: Whether it is one page: with the first parameters and findings only.
 
     Returns:
         Lines of printable ASCII.
     """
     kind = f"FMI {facts['fmi_version']}"
-    return "\n".join([*headed(facts, kind, _rows(facts)), *tables(facts)])
+    return "\n".join([*headed(facts, kind, _rows(facts)), *tables(facts, is_short)])
 
 
-def tables(facts: Mapping[str, Any]) -> Iterator[str]:
-    """Body of an overview: the trial, findings, variables, and the number of the others.
+def tables(facts: Mapping[str, Any], is_short: bool) -> Iterator[str]:
+    """The part of an overview below the heading: the trial, findings, variables.
 
     Args:
-        facts: Result of ``overview``.
+        facts: The result of ``overview``.
+        is_short: Whether only the first parameters and findings are listed.
     """
-    yield from (*_trial_lines(facts), *_findings(facts), *_tables(facts), *_not_listed(facts))
+    yield from _trial_lines(facts)
+    yield from _findings(facts["findings"], _MOST_FINDINGS if is_short else None)
+    yield from _tables(facts, _MOST_PARAMETERS if is_short else None)
+    yield from _not_listed(facts)
 
 
 def headed(facts: Mapping[str, Any], kind: str, rows: Mapping[str, str]) -> Iterator[str]:
@@ -273,23 +280,28 @@ def _trial_lines(facts: Mapping[str, Any]) -> Iterator[str]:
         yield f"  - {plain(sentence)}"
 
 
-def _findings(facts: Mapping[str, Any]) -> Iterator[str]:
-    if facts["findings"]:
-        yield f"\nFindings ({len(facts['findings'])})"
-    for finding in facts["findings"][:_MOST_FINDINGS]:
-        yield f"  - {plain(finding)}"
-    if len(facts["findings"]) > _MOST_FINDINGS:
-        yield "  - more are listed with --json"
+def _findings(findings: Sequence[str], most: int | None) -> Iterator[str]:
+    if findings:
+        yield f"\nFindings ({len(findings)})"
+        yield from _first([f"- {plain(finding)}" for finding in findings], most)
 
 
-def _tables(facts: Mapping[str, Any]) -> Iterator[str]:
+def _first(lines: Sequence[str], most: int | None) -> Iterator[str]:
+    """The first lines, and the number of the others."""
+    yield from (f"  {line}" for line in lines[:most])
+    if most is not None and len(lines) > most:
+        yield f"  {len(lines) - most} more with -v"
+
+
+def _tables(facts: Mapping[str, Any], most_parameters: int | None) -> Iterator[str]:
     causalities = [*_HEADINGS, *facts["variable_counts"]]  # unknown ones last
     for causality in dict.fromkeys(causalities):
         rows = [v for v in facts["variables"] if v["causality"] == causality]
         if rows:
             yield f"\n{_HEADINGS.get(causality, plain(causality))} ({len(rows)})"
-            table = aligned([_COLUMNS, *map(_cells, rows)], _WIDEST)
-            yield from (f"  {line}" for line in table)
+            head, *lines = aligned([_COLUMNS, *map(_cells, rows)], _WIDEST)
+            yield f"  {head}"
+            yield from _first(lines, most_parameters if causality == "parameter" else None)
 
 
 def _not_listed(facts: Mapping[str, Any]) -> Iterator[str]:

@@ -35,15 +35,15 @@ from fmugym.tools.skeleton import (
 __all__ = ["Proposal", "preload_line"]
 
 _HEAD: Final = """\
-# A task for the FMU {file}. Decide what is marked with TODO, then try
-#   fmugym validate FILE       (what is wrong with this task?)
-#   fmugym simulate FILE       (what happens in an episode?)
-#   fmugym train FILE --output agent
+# A task for the FMU {file}. Complete the lines with TODO, then try
+#   fmugym validate FILE                (mistakes, and their cures)
+#   fmugym simulate FILE                (an episode)
+#   fmugym train FILE --output agent    (an agent)
 # Every key is described in docs/task-file.md.
 fmu = {path}
 time_step = {step}  # s{note}
 episode_length = {length}  # s{note_of_length}
-reward = "-abs({goal} - {setpoint})"  # TODO: a guess: {goal} is to follow {setpoint}
+reward = "-abs({goal} - {setpoint})"  # TODO: a guess: {goal} follows {setpoint}
 # terminated = "abs({goal}) > 10"  # TODO: does the task have an end?
 """
 
@@ -173,7 +173,7 @@ class Proposal:
         if not self._skeleton.has_duration:
             yield "the FMU does not say how long it takes: 'episode_length' is a guess"
         if self._skeleton.left_out:
-            yield f"{self._skeleton.left_out} parameters are left out; 'fmugym info' lists them"
+            yield f"{self._skeleton.left_out} parameters are left out; 'fmugym info -v' lists them"
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
 
@@ -260,7 +260,7 @@ class Proposal:
             f"    # {_quoted(v.name)} looks like a disturbance: [data]?" for v in self._others
         ]
         yield from self._listing("actions", self._actions, others)
-        seen = f'    "{self._setpoint}",  # what {self._aliases[self._goal.name]} is to follow'
+        seen = f'    "{self._setpoint}",  # the set point of {self._aliases[self._goal.name]}'
         yield from self._listing("observations", self._skeleton.outputs, [seen])
 
     def _listing(self, key: str, variables: list[Variable], more: list[str]) -> Iterator[str]:
@@ -283,7 +283,7 @@ class Proposal:
         for variable in self._skeleton.parameters:
             yield f"# {_key(variable.name)} = {_as_toml(given_start(variable))}{remark(variable)}"
         if self._skeleton.left_out:
-            yield f"# {self._skeleton.left_out} more are listed by: fmugym info"
+            yield f"# {self._skeleton.left_out} more are listed by: fmugym info -v"
 
     def _config(self) -> Iterator[str]:
         if self._skeleton.stop_time is not None:
@@ -309,7 +309,7 @@ def preload_line(paths: Sequence[str]) -> str:
 def _controllers(guesses: Mapping[str, str]) -> Iterator[str]:
     yield "[controllers]"
     if guesses:
-        yield "# Guesses, from what steps of the actions do; the least coupled loops come first."
+        yield "# Guesses from step responses of the actions; the least coupled loops come first."
     for guess, text in guesses.items():
         name = guess.lower().replace(" ", "_")
         if not is_table(text):

@@ -64,11 +64,11 @@ _SOLVER: Final = re.compile(
 )
 """Names of parameters that set up the exporter's solver rather than the model."""
 
-END_OF_EXPERIMENT: Final = "that of the FMU's default experiment; an episode ends there"
+END_OF_EXPERIMENT: Final = "of the FMU's default experiment; an episode ends there"
 _NO_STEP_SIZE: Final = "TODO: the FMU gives none that fits"
 
 _PROGRAM: Final = '''\
-"""An environment for the FMU {file}. Decide what is marked with TODO.
+"""An environment for the FMU {file}. Complete the lines with TODO.
 
 Running this file checks the environment.
 """
@@ -259,7 +259,7 @@ class Skeleton:
         for variable in self.parameters:
             yield f"{_quoted(variable.name)}: {literal(variable)},{remark(variable)}"
         if self.left_out:
-            yield f"# {self.left_out} more are listed by: fmugym info"
+            yield f"# {self.left_out} more are listed by: fmugym info -v"
 
     def _times(self) -> Iterator[str]:
         note = "the default of the FMU" if self.has_step_size else _NO_STEP_SIZE

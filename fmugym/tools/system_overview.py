@@ -104,17 +104,19 @@ def _component(system: FMUSystem, name: str) -> dict[str, Any]:
     }
 
 
-def as_text_of_system(facts: Mapping[str, Any]) -> str:
+def as_text_of_system(facts: Mapping[str, Any], *, is_short: bool = True) -> str:
     """Format an overview of a system for a terminal.
 
     Args:
-        facts: Result of ``overview_of_system``.
+        facts: The result of ``overview_of_system``.
+        is_short: As for ``as_text``.
 
     Returns:
         Lines of printable ASCII.
     """
     kind = f"a system of {len(facts['system']['components'])} FMUs"
-    return "\n".join([*headed(facts, kind, _rows(facts)), *_parts(facts["system"]), *tables(facts)])
+    heading = [*headed(facts, kind, _rows(facts)), *_parts(facts["system"])]
+    return "\n".join([*heading, *tables(facts, is_short)])
 
 
 def _rows(facts: Mapping[str, Any]) -> dict[str, str]:

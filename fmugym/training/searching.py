@@ -199,8 +199,8 @@ class Searching:
         self._on_surrogate = self._on_surrogate and self._is_fmu()
         if self._on_surrogate:
             self.tell(
-                f"there are not {_FEWEST} rounds of {FEW} candidates with episodes of "
-                f"{probe.usual_steps} steps: the search plays on a surrogate of the FMU"
+                f"{_FEWEST} rounds of {FEW} candidates with episodes of {probe.usual_steps} steps "
+                "would take too long: the search plays on a surrogate of the FMU"
             )
             return
         if took * _ENOUGH > left:

@@ -149,8 +149,8 @@ class TwinSearch:
     def _fitted(self) -> Surrogate:
         found = fit(self.courses)
         self.tell(
-            f"surrogate of {self.evaluator.steps} steps: {found.terms.form}; simulations are "
-            f"wrong by {100 * found.error:.2g} % of what outputs vary"
+            f"surrogate of {self.evaluator.steps} steps: {found.terms.form}; errors of "
+            f"simulations are {100 * found.error:.2g} % of the variation of outputs"
         )
         return found
 

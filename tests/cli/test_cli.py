@@ -137,6 +137,25 @@ class TestInfo:
         assert "theta_ddot" in everything
         assert "Not listed" not in everything
 
+    @pytest.mark.parametrize(
+        ("options", "listed"), [((), 20), (("-v",), 25), (("--all",), 25), (("--filter", "p*"), 25)]
+    )
+    def test_of_many_parameters_twenty_are_listed(self, info, make_fmu, options, listed):
+        many = (parameter(f"p{number:02}", '<Real start="1"/>') for number in range(25))
+        text = info(make_fmu(INPUT, OUTPUT, *many), *options)
+        assert "Parameters (25)" in text
+        assert len(re.findall(r"^  p\d\d ", text, re.M)) == listed
+        assert ("5 more with -v" in text) is (listed == 20)
+
+    def test_of_twenty_parameters_all_are_listed(self, info, make_fmu):
+        text = info(make_fmu(*(parameter(f"p{n:02}", '<Real start="1"/>') for n in range(20))))
+        assert "p19" in text
+        assert "more with -v" not in text
+
+    def test_the_json_has_all_parameters(self, facts, make_fmu):
+        many = (parameter(f"p{number:02}", '<Real start="1"/>') for number in range(25))
+        assert len(facts(make_fmu(*many))["variables"]) == 25
+
     def test_filter_finds_names_of_every_causality(self, facts):
         found = facts(fmugym.bundled_fmu("Pendulum"), "--filter", "theta_d?*")
         names = [v["name"] for v in found["variables"]]
@@ -394,7 +413,7 @@ class TestNew:
         assert code == 0
         assert [f"# p{n} = {n}.0" in out for n in (39, 40)] == [True, False]
         assert "# 7 more are listed by: fmugym info" in out
-        assert "7 parameters are left out; 'fmugym info' lists them" in err
+        assert "7 parameters are left out; 'fmugym info -v' lists them" in err
 
     def test_locals_that_look_like_results_are_listed(self, make_fmu, ran):
         """As comments: each is a line of [variables] once its # is gone."""

@@ -225,7 +225,7 @@ class TestCourse:
         assert code == 0, err
         facts = facts_of(tmp_path / "a")
         assert 0.5 * ceiling < facts["steps"] <= ceiling
-        options = words_after(err, "agent;")
+        options = words_after(err, "repeat the search:")
         code, again, err = searched(task, tmp_path / "b", *options)
         assert (code, again) == (0, out), err
         assert content(tmp_path / "b") == content(tmp_path / "a")
@@ -235,7 +235,7 @@ class TestCourse:
         options = "--minutes", "0.2", "--output", tmp_path / "a"
         code, out, err = cli(*arguments, *options)
         assert code == 0, err
-        options = words_after(err, "agent;")
+        options = words_after(err, "repeat the search:")
         code, again, err = cli(*arguments, *options, "--output", tmp_path / "b")
         assert (code, again) == (0, out), err
         assert content(tmp_path / "b") == content(tmp_path / "a")
@@ -299,8 +299,7 @@ class TestCourse:
 
 def words_after(text, mark):
     """The options in the last line that a search prints."""
-    words = text.rpartition(mark)[2].split()
-    return words[: words.index("repeats")]
+    return text.rpartition(mark)[2].split()
 
 
 CRANE = {
@@ -371,6 +370,7 @@ class TestOutput:
         assert out.count("\n") == 1
         for fact in ("lazy", "tuned pi", "unseen episodes", "effort", "of at most 1"):
             assert fact in out
+        assert f"its controller: {facts_of(tmp_path / 'a')['controller']}" in err
 
     @pytest.mark.parametrize(
         ("is_terminal", "has_tqdm"), [(True, True), (False, True), (True, False)]

@@ -112,6 +112,24 @@ def test_the_index_names_every_page():
     assert {path.name for path in DOCS.glob("*.md")} - {INDEX.name} == listed
 
 
+SIX = ("README.md", "tutorial.md", "task-file.md", "class.md", "training.md", "failures.md")
+
+
+def test_the_index_begins_with_six_pages():
+    rows = re.findall(r"^\| \[[^]]+\]\((\S+)\)", INDEX.read_text(), re.M)
+    assert ("README.md", *rows[:5]) == SIX
+
+
+def test_the_five_pages_beside_the_index_lead_to_all_others():
+    reached = {
+        name
+        for page in SIX[1:]
+        for name in re.findall(r"\]\(([\w-]+\.md)", (DOCS / page).read_text())
+    }
+    for_contributors = {"architecture.md"}
+    assert {path.name for path in DOCS.glob("*.md")} - {*SIX} - for_contributors <= reached
+
+
 def test_the_index_lists_every_extra():
     with (ROOT / "pyproject.toml").open("rb") as file:
         extras = tomllib.load(file)["project"]["optional-dependencies"]
@@ -124,6 +142,23 @@ def test_contributors_are_told_of_every_folder_of_the_package():
     tree, _ = blocks(ROOT / "CONTRIBUTING.md", "text")
     told = set(re.findall(r"(\w+)/", tree["code"]))
     assert {path.parent.name for path in (ROOT / "fmugym").glob("*/__init__.py")} <= told
+
+
+def test_the_drawing_of_the_house_has_every_folder_of_the_package():
+    house = blocks(DOCS / "architecture.md", "text")[0]["code"]
+    drawn = set(re.findall(r"(\w+)/", house))
+    packages = {path.parent.name for path in (ROOT / "fmugym").glob("*/__init__.py")}
+    assert drawn - packages == {"native"}
+    assert packages <= drawn
+
+
+@pytest.mark.parametrize("document", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_files_of_which_contributors_are_told_exist(document):
+    named = re.findall(
+        r"`((?:fmugym|native|tests|docs)/[\w./]+\.\w+)`", (ROOT / document).read_text()
+    )
+    assert len(named) > 8
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def test_messages_in_the_table_of_errors_exist():

@@ -1,4 +1,4 @@
-"""The examples ppo.py and compare_ppo.py: PPO in one file."""
+"""The example ppo.py: PPO in one file."""
 
 from types import SimpleNamespace
 
@@ -127,11 +127,3 @@ def test_actions_of_a_box_stay_within_it(ppo):
     agent = ppo.Agent(envs, ppo.Settings())
     given = agent.for_env(torch.tensor([[-1.0, 1.0], [0.0, 0.0], [5.0, -5.0]]))
     assert given.tolist() == [[-2, 10], [0, 5], [2, 0]]
-
-
-def test_the_comparison_with_stable_baselines(example, capsys):
-    pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3: the extra sb3")
-    example("compare_ppo").main(["--seeds", "1", "--steps", "2100"])
-    table = capsys.readouterr().out
-    assert table.count("ppo.py") == table.count("Stable-Baselines3") == 2
-    assert table.count(" of 1 ") == 4

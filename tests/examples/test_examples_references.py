@@ -18,7 +18,7 @@ from fmugym import FMUVectorEnv, bundled_fmu
 STEPS = 60
 
 
-def swing(q, v, torques, step, *, m=0.06, length=0.1, b=4e-4, c=0.0, g=9.81, rod=False):
+def swing(q, v, torques, step, *, m=0.06, length=0.1, b=4e-4, g=9.81, rod=False):
     """Angle from hanging and velocity after each step, shape (steps, 2)."""
     inertia, weight = m * length**2, m * g * length
     if rod:
@@ -27,8 +27,7 @@ def swing(q, v, torques, step, *, m=0.06, length=0.1, b=4e-4, c=0.0, g=9.81, rod
     for torque in torques:
 
         def derivative(_, state, torque=torque):
-            moment = torque - b * state[1] - c * math.tanh(state[1] / 0.05)
-            return state[1], (moment - weight * math.sin(state[0])) / inertia
+            return state[1], (torque - b * state[1] - weight * math.sin(state[0])) / inertia
 
         found = solve_ivp(derivative, (0, step), states[-1], "DOP853", rtol=1e-10, atol=1e-11)
         states.append(found.y[:, -1])
@@ -41,7 +40,7 @@ def away(q):
 
 
 def swing_up(drawn, torques):
-    """Of mpc_pendulum.py; others plan with it, too."""
+    """Of mpc_pendulum.py."""
     q, v = swing(0, 0, torques, 0.05, m=1, length=1, b=0.05, g=10, rod=True).T
     rewards = -away(q) - 0.1 * v**2 - 0.001 * torques**2
     return np.stack([q - np.pi, v], axis=1), rewards, np.zeros(STEPS)
@@ -83,16 +82,6 @@ def test_a_pendulum_with_a_motor(example, task, seed):
             many = envs.step(np.full((2, 1), action))
             assert many.rewards.tolist() == [reward] * 2
             assert many.terminated.tolist() == [terminated] * 2
-
-
-def test_a_free_swing(example):
-    """Of identify_pendulum.py."""
-    identify = example("identify_pendulum")
-    expected = swing(2.5, 0, np.zeros(STEPS), 0.02, c=2e-3)
-    with closing(identify.Cell(2.5)) as env:
-        env.reset()
-        found = [env.step(np.zeros(1)) and env.state for _ in range(STEPS)]
-    np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
 def test_a_system(example, tmp_path):

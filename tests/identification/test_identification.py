@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import values_tools
-from example_tools import run_example
 from fmu_tools import PlainEnv
 from letters import wide
 from scipy.integrate import solve_ivp
@@ -480,9 +479,3 @@ def free_fall(index):
         time, q, q_dot = (data[f"ff{index}_{name}"] for name in ("t", "q", "dq"))
     outputs = {"q1": q[:, 0], "q2": q[:, 1], "q1_dot": q_dot[:, 0], "q2_dot": q_dot[:, 1]}
     return Trajectory(time, outputs)
-
-
-def test_example(tmp_path):
-    printed = run_example("identify_pendulum.py", folder=tmp_path)
-    assert "with Coulomb friction: autocorrelation" in printed
-    assert [path.name for path in tmp_path.iterdir()] == ["identified_pendulum.png"]

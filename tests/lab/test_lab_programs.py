@@ -102,15 +102,3 @@ class TestIdentification:
         lengths = [float(cm) / 100 for cm in re.findall(r"length = ([.\d]+) cm", printed)]
         assert lengths == pytest.approx([LENGTH] * 2, rel=TOLERANCE)
         assert list(tmp_path.iterdir()) == []
-
-
-class TestEpisodes:
-    @pytest.mark.parametrize("seed", [0, 1])
-    def test_learns_to_swing_higher(self, tmp_path, seed):
-        printed = run_example("lab_episodes.py", "--fast", "--seed", str(seed), folder=tmp_path)
-        first, best = map(
-            float, re.findall(r"([.\d]+) rods at first, ([.\d]+) at best", printed)[0]
-        )
-        assert best > 2 * first
-        assert printed.count("episode ") == 10
-        assert list(tmp_path.iterdir()) == []
