@@ -252,6 +252,9 @@ class Pool:
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
         """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
 
+    def count_steps(self) -> None:
+        """Add the steps so far to the counts."""
+
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""
 

@@ -55,7 +55,7 @@ Answer answer_after(Pool *pool, const Reader *reader, Writer *writer, ptrdiff_t 
     begin_again(writer);
     write_integer(writer, failed);
     write_failure(writer, pool, (size_t)failed);
-    return ANSWER_FAILURE;
+    return ANSWER_TROUBLE;
 }
 
 static Answer answer(Asked *a, ptrdiff_t failed) {
@@ -213,18 +213,12 @@ static Answer answer_failure(Asked *a) {
     return answer(a, -1);
 }
 
-static Answer answer_count_steps(Asked *a) {
-    pool_count_steps(a->pool);
-    return answer(a, -1);
-}
-
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer) {
     static Answer (*const answers[REQUESTS])(Asked *) = {
         [REQUEST_WRITE] = answer_write,
         [REQUEST_READ] = answer_read,
         [REQUEST_SAVE_STATES] = answer_save_states,
         [REQUEST_RESTORE_STATES] = answer_restore_states,
-        [REQUEST_COUNT_STEPS] = answer_count_steps,
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_DIFFERENTIATE] = answer_differentiate,
     };

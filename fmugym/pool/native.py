@@ -255,7 +255,7 @@ class NativePool(AskingPool):
 
     def _count_steps(self) -> None:
         if self._close.alive:
-            self._ask_pool(Request.COUNT_STEPS, b"", Reader.end)
+            self._pool.count_steps()
 
     def close(self) -> None:
         """See ``Pool.close``."""

@@ -43,34 +43,28 @@ class Request(IntEnum):
 
     OPEN = 0
     STEP = 1
-    STEP_SOME = 2
-    RESET = 3
-    SAVE = 4
-    RESTORE = 5
-    RELEASE = 6
-    WRITE = 7
-    READ = 8
+    START = 2
+    READ = 3
+    WRITE = 4
+    DIFFERENTIATE = 5
+    SAVE = 6
+    RESTORE = 7
+    RELEASE = 8
     SAVE_STATES = 9
     RESTORE_STATES = 10
-    COUNT_STEPS = 11
-    FAILURE = 12
-    DIFFERENTIATE = 13
-    CLOSE = 14
+    FAILURE = 11
+    CLOSE = 12
 
 
 class Answer(IntEnum):
-    """The codes of what workers send; the letters are those of ``native/requests.h``."""
+    """The codes of answers; the letters are those of ``native/requests.h``."""
 
-    FINE = ord("F")
-    """The step was done, and no status is worse than a warning."""
-    TROUBLE = ord("T")
-    """The step was done, and some statuses are worse than a warning."""
     RESULT = ord("R")
+    TROUBLE = ord("T")
+    """To a step: some statuses are worse than a warning. To others: the failure of an instance."""
     ERROR = ord("E")
-    """Why there is no result: a text."""
-    FAILURE = ord("X")
-    """Why there is no result: the failure of an instance."""
-    MESSAGE = ord("L")
+    """The reason why there is no result, a text."""
+    LOG = ord("L")
     """A message of the FMU, which may come at any time."""
     FAULT = ord("D")
     """The exit status of the process, which ends now. Only programs in Wine tell it."""
@@ -168,7 +162,7 @@ class Answers:
             return read(reader)
         if code == Answer.ERROR:
             return SimulationError(reader.text())
-        if code == Answer.FAILURE:
+        if code == Answer.TROUBLE:
             return SimulationError(self.failure(reader, reader.index(self.count)))
         raise DamagedError(f"the code {code}")
 

@@ -144,6 +144,17 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return give_up(&c);
 }
 
+static void do_count_steps(PyPool *self, bool alone, void *context) {
+    (void)alone;
+    (void)context;
+    pool_count_steps(&self->pool);
+}
+
+PyObject *py_count_steps(PyObject *object, PyObject *unused) {
+    (void)unused;
+    return perform((PyPool *)object, NEVER_SHORT, do_count_steps, NULL) ? Py_NewRef(Py_None) : NULL;
+}
+
 /* What is asked for besides steps and resets: see ../requests.h. */
 
 typedef struct {

@@ -125,6 +125,7 @@ static PyMethodDef methods[] = {
     {"play_before", py_play_before, METH_O, NULL},
     {"play_after", py_play_after, METH_O, NULL},
     {"reset_by", py_reset_by, METH_O, NULL},
+    {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),
     {"ask", py_ask, METH_VARARGS, NULL},

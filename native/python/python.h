@@ -79,6 +79,7 @@ PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_ask(PyObject *object, PyObject *args);
 PyObject *py_save(PyObject *object, PyObject *unused);
+PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 /* A function of the module */

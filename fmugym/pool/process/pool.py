@@ -166,14 +166,14 @@ class ProcessPool(AskingPool):
         used = {s for s in supervisors if not s.is_new}
         kills = {s: s.kills for s in supervisors}
         alive = self._group.revive(supervisors)
+        np.copyto(self._mask, mask)
 
         def tell(supervisor: Supervisor) -> None:
-            block, writer = supervisor.block, Writer().block(listing)
-            writer.array(values[:, block], np.float64).array(mask[block], np.bool_)
+            content = Writer().block(listing).array(values[:, supervisor.block], np.float64).form()
             supervisor.forget_output()
             if texts:
                 supervisor.lend(texts)
-            supervisor.tell(Request.RESET, writer.form(), supervisor.read_growth)
+            supervisor.tell(Request.START, content, supervisor.read_growth)
 
         for supervisor in self._group.run(RESET, alive, tell):
             supervisor.note_success()
@@ -244,13 +244,10 @@ class ProcessPool(AskingPool):
             return self._step(None)
 
     def _step(self, skip: MaskArray | None) -> int:
-        request = Request.STEP
-        if skip is not None or self._group.any_lost:
-            request = Request.STEP_SOME
-            np.logical_or(self._group.lost, False if skip is None else skip, out=self._mask)
-        replies = self._group.run(
-            A_STEP, self._group.able, lambda supervisor: supervisor.step(request)
-        )
+        np.copyto(self._mask, self._group.lost)
+        if skip is not None:
+            np.logical_or(self._mask, skip, out=self._mask)
+        replies = self._group.run(A_STEP, self._group.able, Supervisor.step)
         if not self._group.any_lost and Answer.TROUBLE not in replies.values():
             return 0
         self._group.note_lost()
@@ -300,29 +297,20 @@ class ProcessPool(AskingPool):
             supervisor = self._group.of(index)
             if not self._group.lost[index]:
                 within, tell = index - supervisor.block.start, supervisor.answers.failure
-                content = Writer().integers(within).form()
-                for text in self._answers(
-                    [supervisor], Request.FAILURE, content, lambda reader: tell(reader, within)
-                ):
+                question = Writer().integers(within).form(), lambda reader: tell(reader, within)
+                replies = self._group.run(
+                    "a question", [supervisor], lambda s: s.tell(Request.FAILURE, *question)
+                )
+                for text in replies.values():
                     if text or self.statuses[index] <= WARNING_CODE:
                         return f"{text}{supervisor.printed}"
             return supervisor.reason or INTERRUPTED
 
-    def _answers(self, supervisors: Sequence[Supervisor], *question: Any) -> list[Any]:
-        """Ask workers for what takes no time; see ``Supervisor.tell``."""
-        replies = self._group.run("a question", supervisors, lambda s: s.tell(*question))
-        return list(replies.values())
-
     def _count_steps(self) -> None:
-        """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
+        """See ``CountedPool``; workers count in the memory that they share."""
         with self._lock:
-            if not self._group.refusal:
-                self._answers(self._group.able, Request.COUNT_STEPS)
-            self._take_counts()
-
-    def _take_counts(self) -> None:
-        for supervisor in self._group.supervisors:
-            supervisor.take_counts()
+            for supervisor in self._group.supervisors:
+                supervisor.take_counts()
 
     def forget_health(self) -> None:
         """See ``Pool.forget_health``."""
@@ -338,7 +326,7 @@ class ProcessPool(AskingPool):
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """See ``Pool.info``."""
         if self._spec.fault_retries:
-            self._take_counts()
+            self._count_steps()
         return super().info()
 
     def _ask(

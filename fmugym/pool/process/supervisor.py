@@ -72,7 +72,7 @@ _LONGEST_KILL: Final = 2.0
 _GIVEN_UP: Final = "ended with exit status 1"
 """What Wine does if it gets no server."""
 
-_STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
+_STEPPED: Final = (Answer.RESULT, Answer.TROUBLE)
 
 
 def timeout_factor(doing: str) -> int:
@@ -350,14 +350,14 @@ class Supervisor:
 
     # Requests and replies.
 
-    def step(self, request: Request) -> None:
+    def step(self) -> None:
         """Ask the worker to step; failures show in the reply."""
         self.is_busy, self._asked, self._read = True, time.monotonic(), None
         self._copies.give_for_step()
         try:
             if self.released:
                 self._release()
-            self._channel.send(request, deadline=self.deadline)
+            self._channel.send(Request.STEP, deadline=self.deadline)
         except OSError:  # "Ignoring" takes longer
             return
 
@@ -412,7 +412,7 @@ class Supervisor:
             doing: What the worker does, for the cause of a death.
 
         Returns:
-            ``Answer.FINE`` or ``Answer.TROUBLE`` for a step; the result; or a ``SimulationError``.
+            ``Answer.RESULT`` or ``TROUBLE`` for a step; the result; or a ``SimulationError``.
 
         Raises:
             LostError: If the worker has died or is late.
@@ -468,7 +468,7 @@ class Supervisor:
             if self._channel.wait(left):
                 try:
                     code, size = self._channel.receive_head(deadline)
-                    if read is None and code in _STEPPED:
+                    if read is None and not size and code in _STEPPED:
                         return code
                     result = self._take(code, self._channel.receive_content(size, deadline), read)
                 except LateError:
@@ -487,7 +487,7 @@ class Supervisor:
     ) -> tuple[Any] | None:
         """Take a message; returns the answer to the request if it is one."""
         reader = Reader(content)
-        if code == Answer.MESSAGE:
+        if code == Answer.LOG:
             self._pass_on(reader)
         elif code == Answer.FAULT:
             self._fault = reader.integer()
