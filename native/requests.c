@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "derivatives.h"
+#include "snapshots.h"
 #include "states.h"
 
 typedef struct {
@@ -146,22 +147,31 @@ static const int64_t *read_instances(Asked *a, size_t *count) {
     return indices;
 }
 
-static Answer answer_save_states(Asked *a) {
-    size_t count;
+static Answer answer_save(Asked *a) {
+    size_t count, number_dropped;
     ptrdiff_t failed = -1;
     const int64_t *indices = read_instances(a, &count);
-    const bool records = read_flag(a->reader);
+    const StateKind kind = (StateKind)read_integer_in(a->reader, KIND_STATE, KIND_COPY);
+    const int64_t number = read_integer(a->reader);
+    const int64_t *dropped = read_array(a->reader, sizeof *dropped, &number_dropped);
 
+    if (kind == KIND_COPY && !a->pool->settings.can_save) {
+        reader_refuse(a->reader, "the FMU cannot get and set its state");
+    }
     if (a->reader->fault == NULL) {
-        failed = pool_save_states(a->pool, indices, count, records, a->writer);
+        for (size_t i = 0; i < number_dropped; i++) {
+            snapshot_drop(a->pool, dropped[i]);
+        }
+        failed = pool_save_states(a->pool, indices, count, kind, number, a->writer);
     }
     return answer(a, failed);
 }
 
 static Answer restore(Asked *a, const int64_t *indices, const State *states, size_t count) {
     for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
-        if (!state_is_sound(a->pool, states[i])) {
-            reader_refuse(a->reader, "a state is damaged, or not of this FMU");
+        const char *fault = state_fault(a->pool, (size_t)indices[i], states[i]);
+        if (fault != NULL) {
+            reader_refuse(a->reader, fault);
         }
     }
     if (a->reader->fault == NULL) {
@@ -185,7 +195,7 @@ Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const Sta
     return restore(&asked, indices, states, count);
 }
 
-static Answer answer_restore_states(Asked *a) {
+static Answer answer_restore(Asked *a) {
     size_t count;
     const int64_t *indices = read_instances(a, &count);
     State *states = calloc(count + 1, sizeof *states);
@@ -217,8 +227,8 @@ Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, W
     static Answer (*const answers[REQUESTS])(Asked *) = {
         [REQUEST_WRITE] = answer_write,
         [REQUEST_READ] = answer_read,
-        [REQUEST_SAVE_STATES] = answer_save_states,
-        [REQUEST_RESTORE_STATES] = answer_restore_states,
+        [REQUEST_SAVE] = answer_save,
+        [REQUEST_RESTORE] = answer_restore,
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_DIFFERENTIATE] = answer_differentiate,
     };

@@ -18,9 +18,6 @@ typedef enum {
     REQUEST_DIFFERENTIATE,
     REQUEST_SAVE,
     REQUEST_RESTORE,
-    REQUEST_RELEASE,
-    REQUEST_SAVE_STATES,
-    REQUEST_RESTORE_STATES,
     REQUEST_FAILURE,
     REQUEST_CLOSE,
     REQUESTS
@@ -39,7 +36,7 @@ typedef enum {
  * a worker answers. The inputs are those of derivatives. */
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer);
 
-/* The same for a request to restore states, where the owner has them at hand. */
+/* The same for a request to restore states that the owner has at hand. */
 Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
                            size_t count);
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import struct
 import weakref
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,6 +19,8 @@ __all__ = [
     "Copies",
     "Head",
     "SaveMethod",
+    "Snapshot",
+    "StateKind",
     "ended_state",
     "head_of",
     "outputs_of",
@@ -29,10 +32,16 @@ IndexArray = npt.NDArray[np.int64]
 
 _HEAD: Final = struct.Struct("<qqdqq")
 SIZE_OF_HEAD: Final = _HEAD.size
-_ENDED: Final = 0
-_RECORD: Final = 2
-_SURROGATE: Final = 3
-"""Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
+
+
+class StateKind(IntEnum):
+    """Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
+
+    ENDED = 0
+    STATE = 1
+    RECORD = 2
+    COPY = 3
+    SURROGATE = 4
 
 
 class SaveMethod(StrEnum):
@@ -52,7 +61,7 @@ class Head(NamedTuple):
     """What a state begins with; the outputs follow, and then the FMU's bytes or a record.
 
     Attributes:
-        kind: Whether it has such bytes, or a record, or nothing.
+        kind: A ``StateKind``.
         steps: The communication steps of the episode.
         start_time: Its first communication point.
         starts: How many start values the record has.
@@ -68,12 +77,12 @@ class Head(NamedTuple):
     @property
     def is_record(self) -> bool:
         """Whether the state is the start and the inputs of an episode."""
-        return self.kind == _RECORD
+        return self.kind == StateKind.RECORD
 
     @property
     def is_of_surrogate(self) -> bool:
         """Whether the state is that of a surrogate, not of an FMU."""
-        return self.kind == _SURROGATE
+        return self.kind == StateKind.SURROGATE
 
 
 def head_of(state: bytes) -> Head:
@@ -89,12 +98,29 @@ def outputs_of(state: bytes, count: int) -> tuple[FloatArray, bytes]:
 
 def ended_state(start_time: float, outputs: FloatArray) -> bytes:
     """The state of an instance that is lost, and could not be stepped any more."""
-    return _HEAD.pack(_ENDED, 0, start_time, 0, 0) + outputs.tobytes()
+    return _HEAD.pack(StateKind.ENDED, 0, start_time, 0, 0) + outputs.tobytes()
 
 
 def surrogate_state(outputs: FloatArray, content: bytes) -> bytes:
     """The state of an instance of a surrogate, which no FMU restores."""
-    return _HEAD.pack(_SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
+    return _HEAD.pack(StateKind.SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
+
+
+class Snapshot:
+    """Copies of all instances' states, in the memory of the FMU.
+
+    Args:
+        pool: The pool, of which there is only a weak reference.
+        number: The number of the snapshot in the pool.
+        states: The state of each instance.
+        dropped: Gets the number when nobody holds the snapshot any more.
+    """
+
+    def __init__(
+        self, pool: Any, number: int, states: Sequence[bytes], dropped: deque[int]
+    ) -> None:
+        self.pool, self.states = weakref.ref(pool), states
+        weakref.finalize(self, dropped.append, number).atexit = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +128,11 @@ class Copies:
     """States that only the instances which have saved them can restore.
 
     Attributes:
-        pool: A weak reference to their pool.
-        snapshot: From its ``save``.
+        snapshot: A snapshot of their pool.
         indices: The instances, shape (M,).
     """
 
-    pool: weakref.ref[Any]
-    snapshot: Any
+    snapshot: Snapshot
     indices: IndexArray
 
 

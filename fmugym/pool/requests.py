@@ -1,8 +1,8 @@
-"""What the engine is asked for besides steps, in this process or through a worker, and its answers.
+"""Requests to the engine, in this process or through a worker, and its answers.
 
-Both are forms; see ``fmugym.pool.form``. ``native/requests.c`` is the other end. A worker runs
-foreign code, so its answers may be anything. What does not fit the question is an error, which ends
-the worker.
+The tables of CONTRIBUTING.md say what each consists of. ``native/requests.c`` is the other end. A
+worker runs foreign code, so its answers may be anything. What does not fit the request is an error,
+which ends the worker.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray
-from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
+from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray, StateKind
 from fmugym.pool.form import BLANK, INTEGER, NUMBER, Writer
 from fmugym.pool.reports import Failure, describe_failure
 from fmugym.pool.spec import PoolSpec
@@ -33,8 +33,8 @@ __all__ = [
     "read_states",
     "read_values",
     "request_listing",
-    "request_restore_states",
-    "request_save_states",
+    "request_restore",
+    "request_save",
 ]
 
 
@@ -49,11 +49,8 @@ class Request(IntEnum):
     DIFFERENTIATE = 5
     SAVE = 6
     RESTORE = 7
-    RELEASE = 8
-    SAVE_STATES = 9
-    RESTORE_STATES = 10
-    FAILURE = 11
-    CLOSE = 12
+    FAILURE = 8
+    CLOSE = 9
 
 
 class Answer(IntEnum):
@@ -153,7 +150,7 @@ class Answers:
         return int(self._block.stop - self._block.start)
 
     def result(self, code: int, reader: Reader, read: Callable[[Reader], Any]) -> Any:
-        """What an answer says as ``read`` reads it, or the error that it tells.
+        """The result that ``read`` reads from an answer, or the error that it tells.
 
         Raises:
             DamagedError: If it is no answer.
@@ -214,12 +211,14 @@ def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
     return Writer().listing(variables, version).form()
 
 
-def request_save_states(indices: IndexArray, records: bool) -> bytes:
+def request_save(
+    indices: IndexArray, kind: StateKind, number: int, dropped: Sequence[int]
+) -> bytes:
     """Save states; see ``SavingPool.save_states``."""
-    return Writer().array(indices, np.int64).integers(records).form()
+    return Writer().array(indices, np.int64).integers(kind, number).array(dropped, np.int64).form()
 
 
-def request_restore_states(states: Sequence[bytes], indices: IndexArray) -> bytes:
+def request_restore(states: Sequence[bytes], indices: IndexArray) -> bytes:
     """Restore states; see ``SavingPool.restore_states``."""
     writer = Writer().array(indices, np.int64)
     for state in states:

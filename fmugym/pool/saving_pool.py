@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
-import weakref
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from itertools import compress
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,16 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
-from fmugym.pool.bundle import Bundle, Copies, IndexArray, SaveMethod, head_of, outputs_of
+from fmugym.pool.bundle import (
+    Bundle,
+    Copies,
+    IndexArray,
+    SaveMethod,
+    Snapshot,
+    StateKind,
+    head_of,
+    outputs_of,
+)
 from fmugym.pool.recorded_inputs import RecordedInputs, inputs_in
 from fmugym.pool.retrying import RetryingPool
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -56,6 +64,8 @@ class SavingPool(RetryingPool):
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> None:
         """Take over what saving needs."""
         self._form = description, spec
+        self._numbers: Iterator[int] = itertools.count(1)
+        self._dropped: deque[int] = deque()
         self._offered = offered_method(description, spec)
 
     def save_by(self, ask_for_method: Callable[[], SaveMethod]) -> None:
@@ -73,7 +83,8 @@ class SavingPool(RetryingPool):
     def save_instances(self, indices: IndexArray) -> Bundle:
         """See ``Pool.save_instances``."""
         replays = self.save_method is not SaveMethod.STATE
-        states = tuple(self.save_states(indices, replays))
+        kind = StateKind.RECORD if replays else StateKind.STATE
+        states = tuple(self.save_states(indices, kind))
         return Bundle(states, replays, self._copies(indices))
 
     def _records(self, states: Sequence[bytes]) -> list[RecordedInputs]:
@@ -87,7 +98,7 @@ class SavingPool(RetryingPool):
         if np.any(self.statuses > WARNING_CODE):
             return None
         try:
-            return Copies(weakref.ref(self), self._copy_all(), np.array(indices))
+            return Copies(self.save(), np.array(indices))
         except SimulationError:  # an episode has ended in another way
             return None
 
@@ -99,8 +110,8 @@ class SavingPool(RetryingPool):
         if bundle.replays:
             there = self._restore_copies(bundle, sources, indices)
             there |= [not head_of(state).is_record for state in states]
-            self._replay(list(compress(states, ~there)), indices[~there])
-            states, indices = tuple(compress(states, there)), indices[there]
+            self._replay(list(itertools.compress(states, ~there)), indices[~there])
+            states, indices = tuple(itertools.compress(states, there)), indices[there]
         elif self.save_method is not SaveMethod.STATE:
             raise SimulationError(
                 "the snapshot has serialized FMU states, which do not work in this pool"
@@ -110,8 +121,20 @@ class SavingPool(RetryingPool):
         return self.statuses
 
     @abstractmethod
-    def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
-        """Save the states of instances, or the records of their episodes.
+    def save_states(
+        self,
+        indices: IndexArray,
+        kind: StateKind,
+        number: int = 0,
+        dropped: Sequence[int] = (),
+    ) -> Sequence[bytes]:
+        """Save the states of instances.
+
+        Args:
+            indices: The instances.
+            kind: FMU states, copies of them, or records of the episodes.
+            number: That of a new snapshot, which keeps the copies.
+            dropped: The numbers of snapshots that are freed before.
 
         Raises:
             SimulationError: If an instance fails, or its episode is not known from the reset on.
@@ -122,24 +145,34 @@ class SavingPool(RetryingPool):
         """Restore a state in each of some instances.
 
         A record only tells what the episode was of an instance that is where it leads to.
+
+        Raises:
+            SimulationError: If a copy is of another instance, or the instance was replaced since.
         """
 
     # Copies
 
-    @abstractmethod
-    def save(self) -> Any:
+    def save(self) -> Snapshot:
         """Copy the FMU states and times of all instances.
 
         Returns:
-            A snapshot for ``restore`` of the same pool. It is freed with its last reference.
+            A snapshot for ``restore`` of the same pool. After its last reference it is freed with
+            the next call of ``save``.
 
         Raises:
             SimulationError: If the FMU offers no state, or an instance cannot save it now.
         """
+        number, everywhere = next(self._numbers), np.arange(self.num_instances)
+        dropped = [self._dropped.popleft() for _ in range(len(self._dropped))]
+        try:
+            states = self.save_states(everywhere, StateKind.COPY, number, dropped)
+        except BaseException:  # some workers may have saved
+            self._dropped.extend((number, *dropped))
+            raise
+        return Snapshot(self, number, states, self._dropped)
 
-    @abstractmethod
     def restore(
-        self, snapshot: Any, mask: MaskArray | None = None
+        self, snapshot: Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """Return instances to a snapshot.
 
@@ -153,10 +186,11 @@ class SavingPool(RetryingPool):
         Raises:
             SimulationError: If the snapshot is of another pool, or an instance was replaced since.
         """
-
-    def _copy_all(self) -> Any:
-        """Copy all states as ``save`` does, but in a way that lets instances be replaced."""
-        return self.save()
+        if not isinstance(snapshot, Snapshot) or snapshot.pool() is not self:
+            raise SimulationError("the snapshot was taken from another pool")
+        indices = np.flatnonzero(self._as_mask(mask))
+        self.restore_states([snapshot.states[i] for i in indices.tolist()], indices)
+        return self.outputs, self.statuses
 
     def _restore_copies(
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
@@ -166,7 +200,7 @@ class SavingPool(RetryingPool):
         No instance may have been replaced since.
         """
         own, copies = np.zeros(len(indices), np.bool_), bundle.copies
-        if copies is None or copies.pool() is not self:
+        if copies is None or copies.snapshot.pool() is not self:
             return own
         mask = np.zeros(self.num_instances, np.bool_)
         own = copies.indices[sources] == indices

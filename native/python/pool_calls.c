@@ -227,7 +227,7 @@ static PyObject *answer_of(const Asking *a) {
     if (writer->failed) {
         return PyErr_NoMemory();
     }
-    return a->request == REQUEST_SAVE_STATES && a->answer == ANSWER_RESULT
+    return a->request == REQUEST_SAVE && a->answer == ANSWER_RESULT
                ? Py_BuildValue("iN", (int)a->answer, tuple_of(writer))
                : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }

@@ -126,8 +126,6 @@ static PyMethodDef methods[] = {
     {"play_after", py_play_after, METH_O, NULL},
     {"reset_by", py_reset_by, METH_O, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
-    {"save", py_save, METH_NOARGS, NULL},
-    FAST("restore", py_restore),
     {"ask", py_ask, METH_VARARGS, NULL},
     {"close", py_close, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},

@@ -36,30 +36,23 @@ static Answer answer_close(Worker *w) {
 }
 
 static Answer answer_in_pool(Worker *w, Request request, Reader *reader, Writer *writer) {
-    return request == REQUEST_START     ? answer_start(w, reader, writer)
-           : request == REQUEST_SAVE    ? answer_save(w, reader, writer)
-           : request == REQUEST_RESTORE ? answer_restore(w, reader, writer)
-           : request == REQUEST_RELEASE ? answer_release(w, reader)
-           : request == REQUEST_CLOSE
-               ? answer_close(w)
-               : pool_answer(&w->pool, shared_inputs(w), request, reader, writer);
+    return request == REQUEST_START   ? answer_start(w, reader, writer)
+           : request == REQUEST_CLOSE ? answer_close(w)
+                                      : pool_answer(&w->pool, shared_inputs(w), request, reader,
+                                                    writer);
 }
 
 static void answer_other(Worker *w, Request request, Reader *reader) {
-    const bool changes = request == REQUEST_START || request == REQUEST_RESTORE ||
-                         request == REQUEST_RESTORE_STATES;
     Writer writer = {.bytes = NULL};
 
     pool_enter(&w->pool);
     const Answer answer = answer_in_pool(w, request, reader, &writer);
     pool_leave(&w->pool);
     worker_report(w);
-    if (changes) {
+    if (request == REQUEST_START || request == REQUEST_RESTORE) {
         worker_publish(w);
     }
-    if (request != REQUEST_RELEASE) {
-        send_answer(w, answer, &writer);
-    }
+    send_answer(w, answer, &writer);
 }
 
 static void answer(Worker *w, Request request, Reader *reader) {

@@ -38,8 +38,6 @@ typedef struct {
     int8_t *statuses;
     List *lists;
     size_t number_of_lists;
-    Snapshot **snapshots; /* NULL for those that were freed */
-    size_t number_of_snapshots;
     int64_t resets;       /* of single instances */
     int64_t first_memory; /* bytes of the process after the first resets; 0 before */
 } Worker;
@@ -51,11 +49,8 @@ void worker_serve(Worker *worker);
  * told why. */
 bool answer_open(Worker *worker, Reader *reader);
 
-/* The answers to requests that are not those of the pool itself, inside of it. */
+/* Starts episodes, inside of the pool. */
 Answer answer_start(Worker *worker, Reader *reader, Writer *writer);
-Answer answer_save(Worker *worker, Reader *reader, Writer *writer);
-Answer answer_restore(Worker *worker, Reader *reader, Writer *writer);
-Answer answer_release(Worker *worker, Reader *reader);
 
 /* Passes on the messages of the FMUs. */
 void worker_report(Worker *worker);

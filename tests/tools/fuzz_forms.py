@@ -29,6 +29,7 @@ from program_tools import code, constants, results_of, uniform_draws
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.expressions.program import SLOT
 from fmugym.pool import PoolSpec, native
+from fmugym.pool.bundle import StateKind
 from fmugym.pool.form import (
     Files,
     form_of_draws,
@@ -331,7 +332,8 @@ def restore(rng, pool, kept):
 
 
 def save_states(rng, pool, kept):
-    kept["states"] = pool.save_states(np.arange(N), rng.random() < 0.5)
+    kind = rng.choice((StateKind.STATE, StateKind.RECORD))
+    kept["states"] = pool.save_states(np.arange(N), kind)
 
 
 def restore_states(rng, pool, kept):

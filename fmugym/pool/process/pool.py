@@ -35,13 +35,13 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.bundle import IndexArray
+from fmugym.pool.bundle import IndexArray, Snapshot, StateKind
 from fmugym.pool.form import Writer
 from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
-from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
+from fmugym.pool.process.states import StatesOfWorkers
 from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.reports import REFUSED_ANEW
@@ -261,35 +261,38 @@ class ProcessPool(AskingPool):
 
         return play_around(self, self._spec, variables, *parts)
 
-    def save(self) -> SnapshotOfWorkers:
+    def save(self) -> Snapshot:
         """See ``SavingPool.save``."""
         with self._lock:
             self._require_present()
-            snapshot = self._states.save()
+            snapshot = super().save()
             self._require_present()
             return snapshot
 
     def restore(
-        self, snapshot: SnapshotOfWorkers, mask: MaskArray | None = None
+        self, snapshot: Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``SavingPool.restore``; a state is lost with the process that saved it."""
-        mask = self._as_mask(mask)
-        self._states.require_own(snapshot)
         with self._lock:
-            self._require_present(mask)
-            self._states.restore(snapshot, mask)
-        return self.outputs, self.statuses
+            self._require_present(self._as_mask(mask))
+            return super().restore(snapshot, mask)
 
-    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+    def save_states(
+        self,
+        indices: IndexArray,
+        kind: StateKind,
+        number: int = 0,
+        dropped: Sequence[int] = (),
+    ) -> list[bytes]:
         """See ``SavingPool.save_states``; the episodes of lost instances have ended."""
         with self._lock:
-            start_time = self._spec.start_time
-            return self._states.save_states(indices, records, start_time, self.outputs)
+            what = kind, number, dropped
+            return self._states.save(indices, what, self._spec.start_time, self.outputs)
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
         """See ``SavingPool.restore_states``; a lost worker is replaced."""
         with self._lock:
-            self._states.restore_states(states, indices)
+            self._states.restore(states, indices)
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""

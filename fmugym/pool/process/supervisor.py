@@ -9,17 +9,13 @@ import os
 import signal
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
-import numpy as np
-
 from fmugym.errors import FMULoadError, printable
 from fmugym.fmi.words import as_messages, quoted
-from fmugym.pool.form import Writer
 from fmugym.pool.health import Arrays
 from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.guard import LONGEST_START
@@ -124,12 +120,10 @@ class Supervisor:
     Attributes:
         block: The indices of the worker's instances.
         answers: Reads the worker's answers.
-        generation: The number of processes that have ended.
         reason: Why the last process died.
         growth: By how many bytes the process has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
         is_busy: Whether a reply is due.
-        released: The snapshots without any reference left, by generation and number.
         receiver: Gets the messages of the worker's FMUs.
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
         initializations: How many initializations its processes have begun.
@@ -148,13 +142,11 @@ class Supervisor:
     ) -> None:
         self.block = setup.block
         self.answers = Answers(setup.description, setup.spec, setup.block)
-        self.generation = 0
         self.reason = ""
         self.losses: list[Loss] = []
         self.initializations = self.kills = 0
         self.growth = 0
         self.is_new = True
-        self.released: deque[tuple[int, int]] = deque()
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
@@ -303,7 +295,6 @@ class Supervisor:
     def _forget_process(self, reason: str) -> None:
         self.forget()
         self._opening = self.is_busy = False
-        self.generation += 1
         self._deaths += 1
         gone = self._deaths >= _MOST_DEATHS
         prefix = f"given up after {self._deaths} deaths in a row: " if gone else ""
@@ -355,8 +346,6 @@ class Supervisor:
         self.is_busy, self._asked, self._read = True, time.monotonic(), None
         self._copies.give_for_step()
         try:
-            if self.released:
-                self._release()
             self._channel.send(Request.STEP, deadline=self.deadline)
         except OSError:  # "Ignoring" takes longer
             return
@@ -378,8 +367,6 @@ class Supervisor:
         self._copies.give()
         self._output.pump()
         with suppress(OSError):
-            if self.released:
-                self._release()
             self._channel.send(request, content, self.deadline)
 
     def lend(self, texts: Sequence[str]) -> None:
@@ -396,13 +383,6 @@ class Supervisor:
         """The telling ones of the last lines since ``forget_output``, to end an error's text."""
         self._output.drain()
         return quoted(as_messages(self._output.lines()), "it printed")
-
-    def _release(self) -> None:
-        generation, numbers = self.generation, []
-        while self.released:
-            owner, number = self.released.popleft()
-            numbers += [number] if owner == generation else []
-        self._channel.send(Request.RELEASE, Writer().array(numbers, np.int64).form(), self.deadline)
 
     def reply(self, deadline: float, doing: str) -> Any:
         """Wait for the reply.

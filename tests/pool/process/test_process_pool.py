@@ -512,7 +512,7 @@ class TestPool:
         with pytest.raises(SimulationError, match="SIGSEGV"):
             pool.save()
         set_up(pool, faulty, ["none", "none"])
-        with pytest.raises(SimulationError, match=r"process has been replaced since: .*SIGSEGV"):
+        with pytest.raises(SimulationError, match="has been replaced since"):
             pool.restore(snapshot)
         outputs, _ = pool.restore(snapshot, np.array([False, True]))
         assert outputs[0].tolist() == [0.0, 0.5]
