@@ -166,10 +166,14 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
     return failed;
 }
 
-size_t pool_restore_states(Pool *pool, const State *states, size_t count) {
+size_t pool_restore(Pool *pool, const State *states, const Snapshot *snapshot, size_t count) {
     const Call call = {.turn = NULL};
-    Task task = {
-        .pool = pool, .call = &call, .operation = RESTORE, .states = states, .listed = true};
+    Task task = {.pool = pool,
+                 .call = &call,
+                 .operation = RESTORE,
+                 .states = states,
+                 .snapshot = snapshot,
+                 .listed = true};
 
     pool->no_return = false;
     return schedule_run(&task, count);

@@ -128,7 +128,9 @@ _Static_assert(sizeof(void *) != 8 || sizeof(Instance) == CACHE_LINE, "an instan
 
 /* The state of an instance in the FMU's memory. */
 typedef struct {
-    void *state;         /* NULL if it is gone */
+    void *state; /* NULL if it is gone */
+    int64_t steps;
+    double start_time;
     uint32_t generation; /* that of the instance */
 } Kept;
 

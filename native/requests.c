@@ -151,36 +151,49 @@ static Answer answer_save(Asked *a) {
     size_t count, number_dropped;
     ptrdiff_t failed = -1;
     const int64_t *indices = read_instances(a, &count);
-    const StateKind kind = (StateKind)read_integer_in(a->reader, KIND_STATE, KIND_COPY);
+    const bool records = read_flag(a->reader);
     const int64_t number = read_integer(a->reader);
     const int64_t *dropped = read_array(a->reader, sizeof *dropped, &number_dropped);
 
-    if (kind == KIND_COPY && !a->pool->settings.can_save) {
+    if (number != NO_SNAPSHOT && !a->pool->settings.can_save) {
         reader_refuse(a->reader, "the FMU cannot get and set its state");
     }
     if (a->reader->fault == NULL) {
         for (size_t i = 0; i < number_dropped; i++) {
             snapshot_drop(a->pool, dropped[i]);
         }
-        failed = pool_save_states(a->pool, indices, count, kind, number, a->writer);
+        failed = number == NO_SNAPSHOT
+                     ? pool_save_states(a->pool, indices, count, records, a->writer)
+                     : snapshot_save(a->pool, number, indices, count);
     }
     return answer(a, failed);
 }
 
-static Answer restore(Asked *a, const int64_t *indices, const State *states, size_t count) {
-    for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
-        const char *fault = state_fault(a->pool, (size_t)indices[i], states[i]);
-        if (fault != NULL) {
-            reader_refuse(a->reader, fault);
+/* Restores sound states in instances, or those of a snapshot. */
+static Answer restore(Asked *a, const int64_t *indices, const State *states,
+                      const Snapshot *snapshot, size_t count) {
+    for (size_t i = 0; i < count && snapshot == NULL && a->reader->fault == NULL; i++) {
+        if (!state_is_sound(a->pool, states[i])) {
+            reader_refuse(a->reader, "a state is damaged, or not of this FMU");
         }
     }
     if (a->reader->fault == NULL) {
         for (size_t i = 0; i < count; i++) {
             a->pool->chosen[i] = (uint32_t)indices[i];
         }
-        pool_restore_states(a->pool, states, count);
+        pool_restore(a->pool, states, snapshot, count);
     }
     return answer(a, -1);
+}
+
+static Answer restore_snapshot(Asked *a, int64_t number, const int64_t *indices, size_t count) {
+    const Snapshot *snapshot =
+        a->reader->fault == NULL ? snapshot_of(a->pool, number, indices, count) : NULL;
+
+    if (snapshot == NULL) {
+        reader_refuse(a->reader, "the snapshot is of an instance that has been replaced since");
+    }
+    return restore(a, indices, NULL, snapshot, count);
 }
 
 Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
@@ -189,15 +202,21 @@ Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const Sta
     size_t wanted;
     const int64_t *indices = read_instances(&asked, &wanted);
 
+    read_integer_in(reader, NO_SNAPSHOT, NO_SNAPSHOT);
     if (wanted != count) {
         reader_refuse(reader, "the states differ in number");
     }
-    return restore(&asked, indices, states, count);
+    return restore(&asked, indices, states, NULL, count);
 }
 
 static Answer answer_restore(Asked *a) {
     size_t count;
     const int64_t *indices = read_instances(a, &count);
+    const int64_t number = read_integer(a->reader);
+
+    if (number != NO_SNAPSHOT) {
+        return restore_snapshot(a, number, indices, count);
+    }
     State *states = calloc(count + 1, sizeof *states);
 
     if (states == NULL) {
@@ -207,7 +226,7 @@ static Answer answer_restore(Asked *a) {
         const Block block = read_block(a->reader);
         states[i] = (State){block.bytes, block.size};
     }
-    const Answer result = restore(a, indices, states, count);
+    const Answer result = restore(a, indices, states, NULL, count);
     free(states);
     return result;
 }

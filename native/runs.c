@@ -8,6 +8,24 @@
 #include "recorded_inputs.h"
 #include "starts.h"
 
+static Status restore_instance(Task *task, Instance *me, size_t place, Scratch scratch) {
+    const size_t index = index_of(task->pool, me);
+
+    if (task->snapshot == NULL) {
+        return instance_take_state(task->pool, me, task->states[place]);
+    }
+    health_count_steps(task->pool, me);
+    record_drop(task->pool, index);
+    const Kept *kept = &task->snapshot->kept[index];
+    const Status status = instance_restore(task->pool, me, kept->state);
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    me->start_time = kept->start_time;
+    instance_count_from(me, kept->steps);
+    return instance_read_outputs(task->pool, me, scratch);
+}
+
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;
@@ -20,9 +38,8 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
             continue;
         }
         Instance *me = &pool->instances[index];
-        const Status status = task->operation == RESTORE
-                                  ? instance_take_state(pool, me, task->states[i])
-                                  : instance_reset(pool, me, call, scratch);
+        const Status status = task->operation == RESTORE ? restore_instance(task, me, i, scratch)
+                                                         : instance_reset(pool, me, call, scratch);
         troubled += note_status(task, index, status);
         if (call->observations != NULL) {
             write_observation(pool, index, call->observations);

@@ -5,10 +5,13 @@
 
 #include "pool.h"
 
-/* Returns NULL if memory runs out. */
-Snapshot *snapshot_new(Pool *pool, int64_t number);
-/* The state of an instance in a snapshot; NULL if there is none, or if the instance was replaced. */
-void *snapshot_state(Pool *pool, int64_t number, size_t index);
+enum { NO_SNAPSHOT = 0 }; /* no number of one */
+
+/* Saves instances in a new snapshot. Returns the index of the first that fails, or -1. */
+ptrdiff_t snapshot_save(Pool *pool, int64_t number, const int64_t *indices, size_t count);
+/* Returns NULL if there is none of this number, or if one of the instances is not in it or has been
+ * replaced since. */
+const Snapshot *snapshot_of(const Pool *pool, int64_t number, const int64_t *indices, size_t count);
 /* Frees a snapshot, if there is one of this number. */
 void snapshot_drop(Pool *pool, int64_t number);
 void snapshots_drop_all(Pool *pool);

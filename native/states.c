@@ -6,7 +6,6 @@
 #include "failures.h"
 #include "instances.h"
 #include "recorded_inputs.h"
-#include "snapshots.h"
 #include "steps.h"
 
 /* Saving */
@@ -83,36 +82,12 @@ static bool serializes(const Pool *pool) {
     return pool->settings.can_save && pool->settings.fmi->serialize != NULL;
 }
 
-static Status save_copy(Pool *pool, Instance *me, StateHead head, Writer *writer) {
-    Snapshot *snapshot = pool->snapshots;
-    const size_t index = index_of(pool, me);
-
-    if (me->phase != PHASE_STEPPING) {
-        return instance_refuse(
-            me, me->phase == PHASE_INSTANTIATED
-                    ? "cannot save the FMU state before the first reset"
-                    : "the instance needs a reset before its FMU state can be saved");
-    }
-    head.kind = KIND_COPY;
-    char *to = add_state(pool, index, head, sizeof snapshot->number, writer);
-    if (to == NULL) {
-        return instance_refuse(me, "out of memory");
-    }
-    memcpy(to, &snapshot->number, sizeof snapshot->number);
-    snapshot->kept[index].generation = me->generation;
-    return instance_save(pool, me, &snapshot->kept[index].state);
-}
-
-static Status save_instance(Pool *pool, Instance *me, StateKind kind, Writer *writer) {
+static Status save_instance(Pool *pool, Instance *me, bool records, Writer *writer) {
     const size_t index = index_of(pool, me);
     const StateHead head = {KIND_ENDED, me->steps, me->start_time, 0, 0};
-    const bool records = kind == KIND_RECORD;
     const bool goes_on = records ? pool->settings.status[index] <= STATUS_WARNING
                                  : me->phase == PHASE_STEPPING;
 
-    if (kind == KIND_COPY) {
-        return save_copy(pool, me, head, writer);
-    }
     if (!goes_on) {
         return add_state(pool, index, head, 0, writer) == NULL ? instance_refuse(me, "out of memory")
                                                             : STATUS_OK;
@@ -124,19 +99,12 @@ static Status save_instance(Pool *pool, Instance *me, StateKind kind, Writer *wr
                             : instance_refuse(me, "the FMU cannot serialize its state");
 }
 
-ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, StateKind kind,
-                           int64_t number, Writer *writer) {
+ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, bool records,
+                           Writer *writer) {
     pool->no_return = false;
-    if (kind == KIND_COPY && snapshot_new(pool, number) == NULL) {
-        instance_refuse(&pool->instances[0], "out of memory");
-        return 0;
-    }
     for (size_t i = 0; i < count; i++) {
         Instance *me = &pool->instances[indices[i]];
-        if (save_instance(pool, me, kind, writer) > STATUS_WARNING) {
-            if (kind == KIND_COPY) {
-                snapshot_drop(pool, number);
-            }
+        if (save_instance(pool, me, records, writer) > STATUS_WARNING) {
             return (ptrdiff_t)indices[i];
         }
     }
@@ -166,32 +134,19 @@ static StateHead head_of(State state) {
     return head;
 }
 
-static int64_t number_in(const char *bytes) {
-    int64_t number;
-
-    memcpy(&number, bytes, sizeof number);
-    return number;
-}
-
-static bool is_sound(const Pool *pool, StateHead head, const char *bytes, size_t size) {
-    return head.kind == KIND_ENDED    ? size == 0
-           : head.kind == KIND_STATE  ? size > 0 && serializes(pool)
-           : head.kind == KIND_COPY   ? size == sizeof(int64_t)
-           : head.kind == KIND_RECORD ? record_fits(pool, head.starts, head.rows, bytes, size)
-                                      : false;
-}
-
-const char *state_fault(Pool *pool, size_t index, State state) {
+bool state_is_sound(const Pool *pool, State state) {
     const size_t before = sizeof(StateHead) + size_of_outputs(pool);
 
-    if (state.size < before ||
-        !is_sound(pool, head_of(state), state.bytes + before, state.size - before)) {
-        return "a state is damaged, or not of this FMU";
+    if (state.size < before) {
+        return false;
     }
-    return head_of(state).kind == KIND_COPY &&
-                   snapshot_state(pool, number_in(state.bytes + before), index) == NULL
-               ? "the snapshot is of an instance that has been replaced since"
-               : NULL;
+    const StateHead head = head_of(state);
+    const size_t rest = state.size - before;
+    return head.kind == KIND_ENDED    ? rest == 0
+           : head.kind == KIND_STATE  ? rest > 0 && serializes(pool)
+           : head.kind == KIND_RECORD ? record_fits(pool, head.starts, head.rows,
+                                                   state.bytes + before, rest)
+                                      : false;
 }
 
 static void put_outputs(const Pool *pool, size_t index, const char *from) {
@@ -211,16 +166,11 @@ static Status restore(Pool *pool, Instance *me, StateHead head, const char *byte
         me->phase = me->phase == PHASE_STEPPING ? PHASE_ENDED : me->phase;
         return STATUS_OK;
     }
-    if (head.kind == KIND_COPY) {
-        status = instance_restore(pool, me,
-                                  snapshot_state(pool, number_in(bytes), index_of(pool, me)));
-    } else {
-        if (me->phase == PHASE_DEAD) {
-            status = instance_return_to_start(pool, me);
-        }
-        if (status <= STATUS_WARNING) {
-            status = set_state(pool, me, bytes, size);
-        }
+    if (me->phase == PHASE_DEAD) {
+        status = instance_return_to_start(pool, me);
+    }
+    if (status <= STATUS_WARNING) {
+        status = set_state(pool, me, bytes, size);
     }
     me->start_time = head.start_time;
     instance_count_from(me, head.steps);

@@ -11,8 +11,9 @@ typedef struct {
     Pool *pool;
     const Call *call;
     int operation;
-    const State *states; /* to restore, one for each place in pool->chosen */
-    bool listed;         /* items are places in pool->chosen, otherwise instances */
+    const State *states;      /* to restore, one for each place in pool->chosen */
+    const Snapshot *snapshot; /* or NULL */
+    bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
     Atomic ended;                         /* episodes that have ended, when playing */

@@ -7,20 +7,20 @@ import weakref
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 __all__ = [
+    "NO_SNAPSHOT",
     "SIZE_OF_HEAD",
     "Bundle",
     "Copies",
     "Head",
     "SaveMethod",
     "Snapshot",
-    "StateKind",
     "ended_state",
     "head_of",
     "outputs_of",
@@ -32,16 +32,13 @@ IndexArray = npt.NDArray[np.int64]
 
 _HEAD: Final = struct.Struct("<qqdqq")
 SIZE_OF_HEAD: Final = _HEAD.size
+_ENDED: Final = 0
+_RECORD: Final = 2
+_SURROGATE: Final = 3
+"""Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
 
-
-class StateKind(IntEnum):
-    """Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
-
-    ENDED = 0
-    STATE = 1
-    RECORD = 2
-    COPY = 3
-    SURROGATE = 4
+NO_SNAPSHOT: Final = 0
+"""No number of a snapshot; ``native/snapshots.h`` has the same."""
 
 
 class SaveMethod(StrEnum):
@@ -61,7 +58,7 @@ class Head(NamedTuple):
     """What a state begins with; the outputs follow, and then the FMU's bytes or a record.
 
     Attributes:
-        kind: A ``StateKind``.
+        kind: Whether it has such bytes, or a record, or nothing.
         steps: The communication steps of the episode.
         start_time: Its first communication point.
         starts: How many start values the record has.
@@ -77,12 +74,12 @@ class Head(NamedTuple):
     @property
     def is_record(self) -> bool:
         """Whether the state is the start and the inputs of an episode."""
-        return self.kind == StateKind.RECORD
+        return self.kind == _RECORD
 
     @property
     def is_of_surrogate(self) -> bool:
         """Whether the state is that of a surrogate, not of an FMU."""
-        return self.kind == StateKind.SURROGATE
+        return self.kind == _SURROGATE
 
 
 def head_of(state: bytes) -> Head:
@@ -98,28 +95,25 @@ def outputs_of(state: bytes, count: int) -> tuple[FloatArray, bytes]:
 
 def ended_state(start_time: float, outputs: FloatArray) -> bytes:
     """The state of an instance that is lost, and could not be stepped any more."""
-    return _HEAD.pack(StateKind.ENDED, 0, start_time, 0, 0) + outputs.tobytes()
+    return _HEAD.pack(_ENDED, 0, start_time, 0, 0) + outputs.tobytes()
 
 
 def surrogate_state(outputs: FloatArray, content: bytes) -> bytes:
     """The state of an instance of a surrogate, which no FMU restores."""
-    return _HEAD.pack(StateKind.SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
+    return _HEAD.pack(_SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
 
 
 class Snapshot:
-    """Copies of all instances' states, in the memory of the FMU.
+    """States of all instances of a pool, which the FMU has copied in its own memory.
 
     Args:
         pool: The pool, of which there is only a weak reference.
         number: The number of the snapshot in the pool.
-        states: The state of each instance.
         dropped: Gets the number when nobody holds the snapshot any more.
     """
 
-    def __init__(
-        self, pool: Any, number: int, states: Sequence[bytes], dropped: deque[int]
-    ) -> None:
-        self.pool, self.states = weakref.ref(pool), states
+    def __init__(self, pool: Any, number: int, dropped: deque[int]) -> None:
+        self.pool, self.number = weakref.ref(pool), number
         weakref.finalize(self, dropped.append, number).atexit = False
 
 

@@ -31,7 +31,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.bundle import IndexArray, StateKind
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import new_arrays
@@ -210,16 +210,9 @@ class NativePool(AskingPool):
             raise found
         return found
 
-    def save_states(
-        self,
-        indices: IndexArray,
-        kind: StateKind,
-        number: int = 0,
-        dropped: Sequence[int] = (),
-    ) -> Sequence[bytes]:
+    def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
         """See ``SavingPool.save_states``."""
-        content = request_save(indices, kind, number, dropped)
-        code, answer = self._open_pool().ask(Request.SAVE, content)
+        code, answer = self._open_pool().ask(Request.SAVE, request_save(indices, records))
         if code == Answer.RESULT:
             states: tuple[bytes, ...] = answer
             return states
@@ -227,8 +220,12 @@ class NativePool(AskingPool):
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
         """See ``SavingPool.restore_states``; the states are not copied."""
-        content = request_restore((), indices)
-        self._ask_pool(Request.RESTORE, content, Reader.end, states)
+        self._ask_pool(Request.RESTORE, request_restore((), indices), Reader.end, states)
+
+    def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
+        """See ``SavingPool._restore_snapshot``."""
+        content = request_restore((), np.flatnonzero(mask), number)
+        self._ask_pool(Request.RESTORE, content, Reader.end)
 
     def _count_steps(self) -> None:
         if self._close.alive:

@@ -19,7 +19,7 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray
-from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray, StateKind
+from fmugym.pool.bundle import NO_SNAPSHOT, SIZE_OF_HEAD, IndexArray
 from fmugym.pool.form import BLANK, INTEGER, NUMBER, Writer
 from fmugym.pool.reports import Failure, describe_failure
 from fmugym.pool.spec import PoolSpec
@@ -212,15 +212,18 @@ def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
 
 
 def request_save(
-    indices: IndexArray, kind: StateKind, number: int, dropped: Sequence[int]
+    indices: IndexArray, records: bool, snapshot: int = NO_SNAPSHOT, dropped: Sequence[int] = ()
 ) -> bytes:
-    """Save states; see ``SavingPool.save_states``."""
-    return Writer().array(indices, np.int64).integers(kind, number).array(dropped, np.int64).form()
+    """Save states or records as values, or in a new snapshot; some others are dropped before."""
+    writer = Writer().array(indices, np.int64).integers(records, snapshot)
+    return writer.array(dropped, np.int64).form()
 
 
-def request_restore(states: Sequence[bytes], indices: IndexArray) -> bytes:
-    """Restore states; see ``SavingPool.restore_states``."""
-    writer = Writer().array(indices, np.int64)
+def request_restore(
+    states: Sequence[bytes], indices: IndexArray, snapshot: int = NO_SNAPSHOT
+) -> bytes:
+    """Restore states, or those of a snapshot."""
+    writer = Writer().array(indices, np.int64).integers(snapshot)
     for state in states:
         writer.block(state)
     return writer.form()

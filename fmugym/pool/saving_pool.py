@@ -22,7 +22,6 @@ from fmugym.pool.bundle import (
     IndexArray,
     SaveMethod,
     Snapshot,
-    StateKind,
     head_of,
     outputs_of,
 )
@@ -83,8 +82,7 @@ class SavingPool(RetryingPool):
     def save_instances(self, indices: IndexArray) -> Bundle:
         """See ``Pool.save_instances``."""
         replays = self.save_method is not SaveMethod.STATE
-        kind = StateKind.RECORD if replays else StateKind.STATE
-        states = tuple(self.save_states(indices, kind))
+        states = tuple(self.save_states(indices, replays))
         return Bundle(states, replays, self._copies(indices))
 
     def _records(self, states: Sequence[bytes]) -> list[RecordedInputs]:
@@ -121,20 +119,8 @@ class SavingPool(RetryingPool):
         return self.statuses
 
     @abstractmethod
-    def save_states(
-        self,
-        indices: IndexArray,
-        kind: StateKind,
-        number: int = 0,
-        dropped: Sequence[int] = (),
-    ) -> Sequence[bytes]:
-        """Save the states of instances.
-
-        Args:
-            indices: The instances.
-            kind: FMU states, copies of them, or records of the episodes.
-            number: That of a new snapshot, which keeps the copies.
-            dropped: The numbers of snapshots that are freed before.
+    def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
+        """Save the states of instances, or the records of their episodes.
 
         Raises:
             SimulationError: If an instance fails, or its episode is not known from the reset on.
@@ -145,9 +131,6 @@ class SavingPool(RetryingPool):
         """Restore a state in each of some instances.
 
         A record only tells what the episode was of an instance that is where it leads to.
-
-        Raises:
-            SimulationError: If a copy is of another instance, or the instance was replaced since.
         """
 
     # Copies
@@ -162,14 +145,18 @@ class SavingPool(RetryingPool):
         Raises:
             SimulationError: If the FMU offers no state, or an instance cannot save it now.
         """
-        number, everywhere = next(self._numbers), np.arange(self.num_instances)
+        number = next(self._numbers)
         dropped = [self._dropped.popleft() for _ in range(len(self._dropped))]
         try:
-            states = self.save_states(everywhere, StateKind.COPY, number, dropped)
+            self._save_snapshot(number, dropped)
         except BaseException:  # some workers may have saved
             self._dropped.extend((number, *dropped))
             raise
-        return Snapshot(self, number, states, self._dropped)
+        return Snapshot(self, number, self._dropped)
+
+    @abstractmethod
+    def _save_snapshot(self, number: int, dropped: Sequence[int]) -> None:
+        """Save all instances in a new snapshot, and free the dropped ones; all are numbers."""
 
     def restore(
         self, snapshot: Snapshot, mask: MaskArray | None = None
@@ -188,9 +175,12 @@ class SavingPool(RetryingPool):
         """
         if not isinstance(snapshot, Snapshot) or snapshot.pool() is not self:
             raise SimulationError("the snapshot was taken from another pool")
-        indices = np.flatnonzero(self._as_mask(mask))
-        self.restore_states([snapshot.states[i] for i in indices.tolist()], indices)
+        self._restore_snapshot(snapshot.number, self._as_mask(mask))
         return self.outputs, self.statuses
+
+    @abstractmethod
+    def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
+        """Restore the instances in the mask."""
 
     def _restore_copies(
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray

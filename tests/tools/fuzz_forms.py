@@ -29,7 +29,6 @@ from program_tools import code, constants, results_of, uniform_draws
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.expressions.program import SLOT
 from fmugym.pool import PoolSpec, native
-from fmugym.pool.bundle import StateKind
 from fmugym.pool.form import (
     Files,
     form_of_draws,
@@ -332,8 +331,7 @@ def restore(rng, pool, kept):
 
 
 def save_states(rng, pool, kept):
-    kind = rng.choice((StateKind.STATE, StateKind.RECORD))
-    kept["states"] = pool.save_states(np.arange(N), kind)
+    kept["states"] = pool.save_states(np.arange(N), rng.random() < 0.5)
 
 
 def restore_states(rng, pool, kept):

@@ -35,7 +35,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.bundle import IndexArray, Snapshot, StateKind
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.form import Writer
 from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
@@ -45,7 +45,7 @@ from fmugym.pool.process.states import StatesOfWorkers
 from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.reports import REFUSED_ANEW
-from fmugym.pool.requests import Answer, Reader, Request, request_listing
+from fmugym.pool.requests import Answer, Reader, Request, request_listing, request_restore
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["ProcessPool"]
@@ -261,33 +261,22 @@ class ProcessPool(AskingPool):
 
         return play_around(self, self._spec, variables, *parts)
 
-    def save(self) -> Snapshot:
-        """See ``SavingPool.save``."""
-        with self._lock:
-            self._require_present()
-            snapshot = super().save()
-            self._require_present()
-            return snapshot
+    def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
+        """See ``SavingPool._restore_snapshot``; a state is lost with the process that saved it."""
 
-    def restore(
-        self, snapshot: Snapshot, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``SavingPool.restore``; a state is lost with the process that saved it."""
-        with self._lock:
-            self._require_present(self._as_mask(mask))
-            return super().restore(snapshot, mask)
+        def tell(supervisor: Supervisor) -> None:
+            indices = np.flatnonzero(mask[supervisor.block])
+            supervisor.tell(Request.RESTORE, request_restore((), indices, number))
 
-    def save_states(
-        self,
-        indices: IndexArray,
-        kind: StateKind,
-        number: int = 0,
-        dropped: Sequence[int] = (),
-    ) -> list[bytes]:
+        with self._lock:
+            self._require_present(mask)
+            self._group.run("restoring a state", self._group.of_any(mask), tell)
+            self._group.note_lost()
+
+    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
         """See ``SavingPool.save_states``; the episodes of lost instances have ended."""
         with self._lock:
-            what = kind, number, dropped
-            return self._states.save(indices, what, self._spec.start_time, self.outputs)
+            return self._states.save(indices, records, self._spec.start_time, self.outputs)
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
         """See ``SavingPool.restore_states``; a lost worker is replaced."""

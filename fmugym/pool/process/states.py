@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fmugym.pool.base import FloatArray
-from fmugym.pool.bundle import IndexArray, StateKind, ended_state
+from fmugym.pool.bundle import IndexArray, ended_state
 from fmugym.pool.process.supervisor import Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.requests import Request, read_states, request_restore, request_save
@@ -24,11 +24,7 @@ class StatesOfWorkers:
         self._group = group
 
     def save(
-        self,
-        indices: IndexArray,
-        what: tuple[StateKind, int, Sequence[int]],
-        start_time: float,
-        outputs: FloatArray,
+        self, indices: IndexArray, records: bool, start_time: float, outputs: FloatArray
     ) -> list[bytes]:
         """Save instances; the episodes of those that are lost have ended with these outputs."""
         states: dict[int, bytes] = {}
@@ -38,7 +34,7 @@ class StatesOfWorkers:
             own = _within(supervisor, parts[supervisor])
             supervisor.tell(
                 Request.SAVE,
-                request_save(own, *what),
+                request_save(own, records),
                 lambda reader: read_states(reader, len(own), len(outputs)),
             )
 
