@@ -151,10 +151,6 @@ class Draws:
         """
 
 @final
-class Snapshot:
-    """The FMU states of a pool, freed with the last reference to this object."""
-
-@final
 class Pool:
     """N instances of one FMU.
 
@@ -252,15 +248,8 @@ class Pool:
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
         """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
 
-    def save(self) -> Snapshot | int:
-        """Save the states of all; or tell which instance refuses."""
-
-    def restore(self, snapshot: Snapshot, mask: Array | None, /) -> int:
-        """Return to a snapshot.
-
-        Raises:
-            ValueError: If the snapshot is another pool's, or an instance was replaced since.
-        """
+    def count_steps(self) -> None:
+        """Add the steps so far to the counts."""
 
     def ask(
         self, request: int, content: bytes, states: Sequence[bytes] = ..., /

@@ -9,7 +9,6 @@
 #include "initial_states.h"
 #include "instances.h"
 #include "recorded_inputs.h"
-#include "snapshots.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */
 static bool make_room_for_starts(Pool *pool, const Access *start) {
@@ -167,23 +166,15 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
     return failed;
 }
 
-size_t pool_restore_states(Pool *pool, const State *states, size_t count) {
+size_t pool_restore(Pool *pool, const State *states, const Snapshot *snapshot, size_t count) {
     const Call call = {.turn = NULL};
-    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .states = states};
+    Task task = {.pool = pool,
+                 .call = &call,
+                 .operation = RESTORE,
+                 .states = states,
+                 .snapshot = snapshot,
+                 .listed = true};
 
     pool->no_return = false;
-    task.listed = true;
     return schedule_run(&task, count);
-}
-
-bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled) {
-    const Call call = {.mask = mask};
-    Task task = {.pool = pool, .call = &call, .operation = RESTORE, .snapshot = snapshot};
-
-    if (!snapshots_fit(pool, snapshot, mask)) {
-        return false;
-    }
-    task.listed = true;
-    *troubled = schedule_run(&task, schedule_choose(pool, mask));
-    return true;
 }

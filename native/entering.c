@@ -1,7 +1,6 @@
 /* Entry into a pool by one thread at a time, and exit from it. */
 
 #include "inside.h"
-#include "snapshots.h"
 
 /* The pools that a thread is inside. An FMU written in Python may call its own pool. It gets an
  * error instead of a deadlock. */
@@ -99,21 +98,7 @@ Entry pool_enter(Pool *pool) {
 }
 
 void pool_leave(Pool *pool) {
-    pool_drop_abandoned(pool);
     floats_restore(&pool->floats);
     end_inside();
     mutex_unlock(&pool->lock);
-}
-
-/* The thread inside the pool may have checked for abandoned snapshots just before, so this
- * thread tries to enter and free the snapshot. If it cannot, the next thread to leave the pool
- * frees it. */
-void pool_abandon(Pool *pool, Snapshot *snapshot) {
-    atomic_set(&snapshot->abandoned, 1);
-    atomic_set(&pool->abandoned, 1);
-    if (mutex_try_lock(&pool->lock)) {
-        begin_inside(pool);
-        pool->floats = floats_now();
-        pool_leave(pool);
-    }
 }

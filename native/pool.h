@@ -44,7 +44,7 @@ typedef struct {
     bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
-    bool records; /* whether it keeps the inputs of episodes; see records.h */
+    bool records; /* whether it keeps the inputs of episodes; see recorded_inputs.h */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -136,8 +136,8 @@ typedef struct {
 
 typedef struct Snapshot {
     struct Snapshot *next; /* next in the list of the pool's snapshots */
-    Atomic abandoned;      /* whether the pool must free it */
-    Kept kept[];           /* of each instance */
+    int64_t number;
+    Kept kept[]; /* of each instance */
 } Snapshot;
 
 /* A value that was set before initialization. */
@@ -147,7 +147,7 @@ typedef struct {
     uint32_t size; /* of a String, of its text with the zero at its end */
 } RecordedStart;
 
-/* The episodes of all instances so far; see records.h. */
+/* The episodes of all instances so far; see recorded_inputs.h. */
 typedef struct Records Records;
 
 typedef struct LibraryCopy LibraryCopy;
@@ -188,7 +188,6 @@ typedef struct Pool {
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
     Records *records; /* NULL if they are not kept */
-    Atomic abandoned; /* whether any snapshot has been abandoned */
     Atomic interrupted; /* whether the present call is to end early */
     Atomic found_stiff; /* whether that was told of the equations */
     Cost costs[OPERATIONS];
@@ -299,20 +298,5 @@ uint64_t number_of_initializations(void);
 ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 /* Sets variables between two steps. Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values);
-
-/* Snapshots. A new snapshot belongs to the pool that saves its states in it; before, it can be freed
- * as any memory. */
-
-Snapshot *snapshot_new(size_t count); /* NULL if memory runs out */
-/* Returns the index of the first instance that fails, or -1. Afterwards the snapshot has been
- * freed or belongs to the pool. */
-ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);
-/* Returns whether all instances in the mask are the ones that were saved. Sets troubled to how
- * many of them now have a status worse than a warning. */
-bool pool_restore(Pool *pool, const Snapshot *snapshot, Mask mask, size_t *troubled);
-
-/* Frees a pool's snapshot, either now or when the thread inside the pool leaves. It never waits
- * and may be called from anywhere, even from inside the pool. */
-void pool_abandon(Pool *pool, Snapshot *snapshot);
 
 #endif

@@ -163,7 +163,7 @@ static void free_instances(Pool *pool) {
 }
 
 void pool_close(Pool *pool) {
-    pool_drop_abandoned(pool);
+    snapshots_drop_all(pool);
     free_instances(pool);
     pool->open = false;
     free(pool->libraries);
@@ -178,7 +178,6 @@ void pool_close(Pool *pool) {
 }
 
 void pool_dispose(Pool *pool) {
-    snapshots_drop_all(pool);
     mutex_destroy(&pool->lock);
     mutex_destroy(&pool->own_making);
 }

@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "derivatives.h"
+#include "snapshots.h"
 #include "states.h"
 
 typedef struct {
@@ -57,7 +58,7 @@ Answer answer_after(Pool *pool, const Reader *reader, Writer *writer, ptrdiff_t 
     begin_again(writer);
     write_integer(writer, failed);
     write_failure(writer, pool, (size_t)failed);
-    return ANSWER_FAILURE;
+    return ANSWER_TROUBLE;
 }
 
 static Answer answer(Asked *a, ptrdiff_t failed) {
@@ -148,20 +149,32 @@ static const int64_t *read_instances(Asked *a, size_t *count) {
     return indices;
 }
 
-static Answer answer_save_states(Asked *a) {
-    size_t count;
+static Answer answer_save(Asked *a) {
+    size_t count, number_dropped;
     ptrdiff_t failed = -1;
     const int64_t *indices = read_instances(a, &count);
     const bool records = read_flag(a->reader);
+    const int64_t number = read_integer(a->reader);
+    const int64_t *dropped = read_array(a->reader, sizeof *dropped, &number_dropped);
 
+    if (number != NO_SNAPSHOT && !a->pool->settings.can_save) {
+        reader_refuse(a->reader, "the FMU cannot get and set its state");
+    }
     if (a->reader->fault == NULL) {
-        failed = pool_save_states(a->pool, indices, count, records, a->writer);
+        for (size_t i = 0; i < number_dropped; i++) {
+            snapshot_drop(a->pool, dropped[i]);
+        }
+        failed = number == NO_SNAPSHOT
+                     ? pool_save_states(a->pool, indices, count, records, a->writer)
+                     : snapshot_save(a->pool, number, indices, count);
     }
     return answer(a, failed);
 }
 
-static Answer restore(Asked *a, const int64_t *indices, const State *states, size_t count) {
-    for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
+/* Restores sound states in instances, or those of a snapshot. */
+static Answer restore(Asked *a, const int64_t *indices, const State *states,
+                      const Snapshot *snapshot, size_t count) {
+    for (size_t i = 0; i < count && snapshot == NULL && a->reader->fault == NULL; i++) {
         if (!state_is_sound(a->pool, states[i])) {
             reader_refuse(a->reader, "a state is damaged, or not of this FMU");
         }
@@ -170,9 +183,19 @@ static Answer restore(Asked *a, const int64_t *indices, const State *states, siz
         for (size_t i = 0; i < count; i++) {
             a->pool->chosen[i] = (uint32_t)indices[i];
         }
-        pool_restore_states(a->pool, states, count);
+        pool_restore(a->pool, states, snapshot, count);
     }
     return answer(a, -1);
+}
+
+static Answer restore_snapshot(Asked *a, int64_t number, const int64_t *indices, size_t count) {
+    const Snapshot *snapshot =
+        a->reader->fault == NULL ? snapshot_of(a->pool, number, indices, count) : NULL;
+
+    if (snapshot == NULL) {
+        reader_refuse(a->reader, "the snapshot is of an instance that has been replaced since");
+    }
+    return restore(a, indices, NULL, snapshot, count);
 }
 
 Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
@@ -181,15 +204,21 @@ Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const Sta
     size_t wanted;
     const int64_t *indices = read_instances(&asked, &wanted);
 
+    read_integer_in(reader, NO_SNAPSHOT, NO_SNAPSHOT);
     if (wanted != count) {
         reader_refuse(reader, "the states differ in number");
     }
-    return restore(&asked, indices, states, count);
+    return restore(&asked, indices, states, NULL, count);
 }
 
-static Answer answer_restore_states(Asked *a) {
+static Answer answer_restore(Asked *a) {
     size_t count;
     const int64_t *indices = read_instances(a, &count);
+    const int64_t number = read_integer(a->reader);
+
+    if (number != NO_SNAPSHOT) {
+        return restore_snapshot(a, number, indices, count);
+    }
     State *states = calloc(count + 1, sizeof *states);
 
     if (states == NULL) {
@@ -199,7 +228,7 @@ static Answer answer_restore_states(Asked *a) {
         const Block block = read_block(a->reader);
         states[i] = (State){block.bytes, block.size};
     }
-    const Answer result = restore(a, indices, states, count);
+    const Answer result = restore(a, indices, states, NULL, count);
     free(states);
     return result;
 }
@@ -215,18 +244,12 @@ static Answer answer_failure(Asked *a) {
     return answer(a, -1);
 }
 
-static Answer answer_count_steps(Asked *a) {
-    pool_count_steps(a->pool);
-    return answer(a, -1);
-}
-
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer) {
     static Answer (*const answers[REQUESTS])(Asked *) = {
         [REQUEST_WRITE] = answer_write,
         [REQUEST_READ] = answer_read,
-        [REQUEST_SAVE_STATES] = answer_save_states,
-        [REQUEST_RESTORE_STATES] = answer_restore_states,
-        [REQUEST_COUNT_STEPS] = answer_count_steps,
+        [REQUEST_SAVE] = answer_save,
+        [REQUEST_RESTORE] = answer_restore,
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_DIFFERENTIATE] = answer_differentiate,
     };

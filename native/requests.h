@@ -8,42 +8,35 @@
 #include "states.h"
 #include "writer.h"
 
-/* In the order of fmugym/pool/requests.py. Workers answer each of them once, but for a release. */
+/* In the order of fmugym/pool/requests.py. Each of them has one answer. */
 typedef enum {
     REQUEST_OPEN,
-    REQUEST_STEP,      /* all instances */
-    REQUEST_STEP_SOME, /* those that are not in the mask */
-    REQUEST_RESET,
+    REQUEST_STEP,
+    REQUEST_START,
+    REQUEST_READ,
+    REQUEST_WRITE,
+    REQUEST_DIFFERENTIATE,
     REQUEST_SAVE,
     REQUEST_RESTORE,
-    REQUEST_RELEASE,
-    REQUEST_WRITE,
-    REQUEST_READ,
-    REQUEST_SAVE_STATES,
-    REQUEST_RESTORE_STATES,
-    REQUEST_COUNT_STEPS,
     REQUEST_FAILURE,
-    REQUEST_DIFFERENTIATE,
     REQUEST_CLOSE,
     REQUESTS
 } Request;
 
-/* What comes back: an answer, or from a worker what may come at any time. */
+/* Answers, and at the end those that a worker may send at any time. */
 typedef enum {
-    ANSWER_FINE = 'F',    /* to a step: no status is worse than a warning */
-    ANSWER_TROUBLE = 'T', /* to a step: some are */
     ANSWER_RESULT = 'R',
-    ANSWER_ERROR = 'E',   /* why there is no result */
-    ANSWER_FAILURE = 'X', /* the same, where an instance has failed */
-    MESSAGE_OF_FMU = 'L',
-    MESSAGE_OF_FAULT = 'D' /* the exit status of the process, which ends now; only in Wine */
+    ANSWER_TROUBLE = 'T', /* of an instance; its failure, but for a step */
+    ANSWER_ERROR = 'E',   /* a text: the reason why there is no result */
+    ANSWER_LOG = 'L',     /* a message of an FMU */
+    ANSWER_FAULT = 'D'    /* the exit status of the process, which ends now; only in Wine */
 } Answer;
 
 /* Answers a request inside of the pool, and writes the content of the answer; it refuses those that only
  * a worker answers. The inputs are those of derivatives. */
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer);
 
-/* The same for a request to restore states, where the owner has them at hand. */
+/* The same for a request to restore states that the owner has at hand. */
 Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
                            size_t count);
 

@@ -13,7 +13,7 @@
 static Status restore_instance(Task *task, Instance *me, size_t place, Scratch scratch) {
     const size_t index = index_of(task->pool, me);
 
-    if (task->states != NULL) {
+    if (task->snapshot == NULL) {
         return instance_take_state(task->pool, me, task->states[place]);
     }
     health_count_steps(task->pool, me);

@@ -7,27 +7,15 @@
 #include "failures.h"
 #include "instances.h"
 
-Snapshot *snapshot_new(size_t count) {
-    return calloc(1, sizeof(Snapshot) + count * sizeof(Kept));
-}
-
 static bool is_own(const Pool *pool, const Kept *kept, size_t index) {
     return kept->state != NULL && kept->generation == pool->instances[index].generation;
 }
 
-static void unlink_snapshot(Pool *pool, const Snapshot *snapshot) {
-    for (Snapshot **link = &pool->snapshots; *link != NULL; link = &(*link)->next) {
-        if (*link == snapshot) {
-            *link = snapshot->next;
-            return;
-        }
-    }
-}
+static void drop(Pool *pool, Snapshot **link) {
+    Snapshot *snapshot = *link;
 
-/* A closed pool has already freed its states with its instances. */
-static void drop_snapshot(Pool *pool, Snapshot *snapshot) {
-    unlink_snapshot(pool, snapshot);
-    for (size_t i = 0; i < pool->settings.count && pool->open; i++) {
+    *link = snapshot->next;
+    for (size_t i = 0; i < pool->settings.count; i++) {
         if (is_own(pool, &snapshot->kept[i], i)) {
             instance_free_state(pool, &pool->instances[i], &snapshot->kept[i].state);
         }
@@ -35,22 +23,18 @@ static void drop_snapshot(Pool *pool, Snapshot *snapshot) {
     free(snapshot);
 }
 
-void pool_drop_abandoned(Pool *pool) {
-    if (!atomic_get(&pool->abandoned)) {
-        return;
-    }
-    atomic_set(&pool->abandoned, 0); /* cleared before the search: no later request is missed */
-    for (Snapshot *snapshot = pool->snapshots, *next; snapshot != NULL; snapshot = next) {
-        next = snapshot->next;
-        if (atomic_get(&snapshot->abandoned)) {
-            drop_snapshot(pool, snapshot);
+void snapshot_drop(Pool *pool, int64_t number) {
+    for (Snapshot **link = &pool->snapshots; *link != NULL; link = &(*link)->next) {
+        if ((*link)->number == number) {
+            drop(pool, link);
+            return;
         }
     }
 }
 
 void snapshots_drop_all(Pool *pool) {
     while (pool->snapshots != NULL) {
-        drop_snapshot(pool, pool->snapshots);
+        drop(pool, &pool->snapshots);
     }
 }
 
@@ -65,24 +49,37 @@ static Status save_instance(Pool *pool, Instance *me, Kept *kept) {
     return instance_save(pool, me, &kept->state);
 }
 
-ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot) {
+ptrdiff_t snapshot_save(Pool *pool, int64_t number, const int64_t *indices, size_t count) {
+    Snapshot *snapshot = calloc(1, sizeof *snapshot + pool->settings.count * sizeof(Kept));
+
     pool->no_return = false;
+    if (snapshot == NULL) {
+        instance_refuse(&pool->instances[0], "out of memory");
+        return 0;
+    }
+    snapshot->number = number;
     snapshot->next = pool->snapshots;
     pool->snapshots = snapshot;
-    for (size_t i = 0; i < pool->settings.count; i++) {
-        if (save_instance(pool, &pool->instances[i], &snapshot->kept[i]) > STATUS_WARNING) {
-            drop_snapshot(pool, snapshot);
-            return (ptrdiff_t)i;
+    for (size_t i = 0; i < count; i++) {
+        const size_t index = (size_t)indices[i];
+        if (save_instance(pool, &pool->instances[index], &snapshot->kept[index]) > STATUS_WARNING) {
+            drop(pool, &pool->snapshots);
+            return (ptrdiff_t)index;
         }
     }
     return -1;
 }
 
-bool snapshots_fit(const Pool *pool, const Snapshot *snapshot, Mask mask) {
-    for (size_t i = 0; i < pool->settings.count; i++) {
-        if ((mask.data == NULL || is_in(mask, i)) && !is_own(pool, &snapshot->kept[i], i)) {
-            return false;
-        }
+const Snapshot *snapshot_of(const Pool *pool, int64_t number, const int64_t *indices,
+                            size_t count) {
+    const Snapshot *snapshot = pool->snapshots;
+
+    while (snapshot != NULL && snapshot->number != number) {
+        snapshot = snapshot->next;
     }
-    return true;
+    for (size_t i = 0; i < count && snapshot != NULL; i++) {
+        const size_t index = (size_t)indices[i];
+        snapshot = is_own(pool, &snapshot->kept[index], index) ? snapshot : NULL;
+    }
+    return snapshot;
 }

@@ -10,7 +10,7 @@
 typedef enum {
     KIND_ENDED, /* nothing: the instance could not be stepped any more */
     KIND_STATE, /* the bytes of the FMU */
-    KIND_RECORD /* the record of the episode, see records.h */
+    KIND_RECORD /* the record of the episode, see recorded_inputs.h */
 } StateKind;
 
 /* fmugym/pool/bundle.py has the same. */
@@ -33,10 +33,10 @@ ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, boo
 
 /* Whether a state is whole, and of a kind that the pool can restore. */
 bool state_is_sound(const Pool *pool, State state);
-/* Restores sound states in the first count instances of pool->chosen. A record only tells what the
+/* Restores sound states in the first count instances of pool->chosen, or those of a snapshot. A record only tells what the
  * episode of an instance was that is where it leads to. Returns how many of them have a status worse
  * than a warning. */
-size_t pool_restore_states(Pool *pool, const State *states, size_t count);
+size_t pool_restore(Pool *pool, const State *states, const Snapshot *snapshot, size_t count);
 /* Restores the state of one instance. */
 Status instance_take_state(Pool *pool, Instance *me, State state);
 

@@ -11,8 +11,8 @@ typedef struct {
     Pool *pool;
     const Call *call;
     int operation;
-    const Snapshot *snapshot; /* the snapshot to restore */
-    const State *states;      /* or a state for each place in pool->chosen */
+    const State *states;      /* to restore, one for each place in pool->chosen */
+    const Snapshot *snapshot; /* or NULL */
     bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */

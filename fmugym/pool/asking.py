@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from fmugym.pool.requests import (
     Request,
     read_values,
     request_listing,
+    request_save,
 )
 from fmugym.pool.saving_pool import SavingPool
 
@@ -83,6 +84,15 @@ class AskingPool(SavingPool):
             lambda block: Writer().forms(listing).array(values[:, block], np.float64).form(),
             lambda reader, _: reader.end(),
         )
+
+    def _save_snapshot(self, number: int, dropped: Sequence[int]) -> None:
+        """See ``SavingPool._save_snapshot``."""
+
+        def content(block: slice) -> bytes:
+            indices = np.arange(block.stop - block.start)
+            return request_save(indices, False, number, dropped)
+
+        self._ask("saving a state", Request.SAVE, content, lambda reader, _: reader.end())
 
     def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
         """See ``Pool.differentiate``."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import weakref
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -13,11 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 __all__ = [
+    "NO_SNAPSHOT",
     "SIZE_OF_HEAD",
     "Bundle",
     "Copies",
     "Head",
     "SaveMethod",
+    "Snapshot",
     "ended_state",
     "head_of",
     "outputs_of",
@@ -33,6 +36,9 @@ _ENDED: Final = 0
 _RECORD: Final = 2
 _SURROGATE: Final = 3
 """Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
+
+NO_SNAPSHOT: Final = 0
+"""No number of a snapshot; ``native/snapshots.h`` has the same."""
 
 
 class SaveMethod(StrEnum):
@@ -97,18 +103,30 @@ def surrogate_state(outputs: _FloatArray, content: bytes) -> bytes:
     return _HEAD.pack(_SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
 
 
+class Snapshot:
+    """States of all instances of a pool, which the FMU has copied in its own memory.
+
+    Args:
+        pool: The pool, of which there is only a weak reference.
+        number: The number of the snapshot in the pool.
+        dropped: Gets the number when nobody holds the snapshot any more.
+    """
+
+    def __init__(self, pool: Any, number: int, dropped: deque[int]) -> None:
+        self.pool, self.number = weakref.ref(pool), number
+        weakref.finalize(self, dropped.append, number).atexit = False
+
+
 @dataclass(frozen=True, eq=False)
 class Copies:
     """States that only the instances which have saved them can restore.
 
     Attributes:
-        pool: A weak reference to their pool.
-        snapshot: From its ``save``.
+        snapshot: A snapshot of their pool.
         indices: The instances, shape (M,).
     """
 
-    pool: weakref.ref[Any]
-    snapshot: Any
+    snapshot: Snapshot
     indices: IndexArray
 
 

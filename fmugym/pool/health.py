@@ -69,7 +69,7 @@ class Arrays(NamedTuple):
     """The arrays of a pool; see ``Pool``.
 
     Attributes:
-        mask: Which instances not to step, shape (N,).
+        mask: The instances that a step leaves out, or that a start starts, shape (N,).
         counts: What each instance does, shape (N, HEALTH_COUNTS).
     """
 

@@ -43,8 +43,8 @@ from fmugym.pool.requests import (
     Answers,
     Reader,
     Request,
-    request_restore_states,
-    request_save_states,
+    request_restore,
+    request_save,
 )
 from fmugym.pool.saving_pool import keeps_records
 
@@ -179,35 +179,6 @@ class NativePool(AskingPool):
             self._open_pool().step(None, _as_mask(skip), observations)
         return self._result
 
-    def save(self) -> _native.Snapshot:
-        """See ``SavingPool.save``."""
-        if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
-            name = self._fmu.description.model_name
-            raise SimulationError(f"{name} cannot get and set its state")
-        return self._copy_all()
-
-    def _copy_all(self) -> _native.Snapshot:
-        """See ``SavingPool._copy_all``."""
-        snapshot = self._open_pool().save()
-        if isinstance(snapshot, int):
-            raise SimulationError(self.failure(snapshot))
-        return snapshot
-
-    def restore(
-        self, snapshot: _native.Snapshot, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``SavingPool.restore``."""
-        pool = self._open_pool()
-        if not isinstance(snapshot, _native.Snapshot):
-            raise SimulationError("the snapshot was taken from another pool")
-        mask = None if mask is None else np.asarray(mask, np.bool_)
-        try:
-            pool.restore(snapshot, mask)
-        except ValueError as error:
-            require_refusal(error)
-            raise SimulationError(str(error)) from None
-        return self._result
-
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
         if not 0 <= index < self.num_instances:
@@ -241,8 +212,7 @@ class NativePool(AskingPool):
 
     def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
         """See ``SavingPool.save_states``."""
-        content = request_save_states(indices, records)
-        code, answer = self._open_pool().ask(Request.SAVE_STATES, content)
+        code, answer = self._open_pool().ask(Request.SAVE, request_save(indices, records))
         if code == Answer.RESULT:
             states: tuple[bytes, ...] = answer
             return states
@@ -250,12 +220,16 @@ class NativePool(AskingPool):
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
         """See ``SavingPool.restore_states``; the states are not copied."""
-        content = request_restore_states((), indices)
-        self._ask_pool(Request.RESTORE_STATES, content, Reader.end, states)
+        self._ask_pool(Request.RESTORE, request_restore((), indices), Reader.end, states)
+
+    def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
+        """See ``SavingPool._restore_snapshot``."""
+        content = request_restore((), np.flatnonzero(mask), number)
+        self._ask_pool(Request.RESTORE, content, Reader.end)
 
     def _count_steps(self) -> None:
         if self._close.alive:
-            self._ask_pool(Request.COUNT_STEPS, b"", Reader.end)
+            self._pool.count_steps()
 
     def close(self) -> None:
         """See ``Pool.close``."""

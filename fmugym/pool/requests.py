@@ -1,8 +1,8 @@
-"""Requests to the engine besides steps, in this process or to a worker, and their answers.
+"""Requests to the engine, in this process or through a worker, and its answers.
 
-Both are forms; see ``fmugym.pool.form``. ``native/requests.c`` is the other end. A worker runs
-foreign code, so its answers may be anything. What does not fit the question is an error, which ends
-the worker.
+The tables of CONTRIBUTING.md say what each consists of. ``native/requests.c`` is the other end. A
+worker runs foreign code, so its answers may be anything. What does not fit the request is an error,
+which ends the worker.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray
-from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
+from fmugym.pool.bundle import NO_SNAPSHOT, SIZE_OF_HEAD, IndexArray
 from fmugym.pool.form import BLANK, FLOAT64, INTEGER, Writer
 from fmugym.pool.reports import Failure, describe_failure
 from fmugym.pool.spec import PoolSpec
@@ -33,8 +33,8 @@ __all__ = [
     "read_states",
     "read_values",
     "request_listing",
-    "request_restore_states",
-    "request_save_states",
+    "request_restore",
+    "request_save",
 ]
 
 
@@ -43,34 +43,25 @@ class Request(IntEnum):
 
     OPEN = 0
     STEP = 1
-    STEP_SOME = 2
-    RESET = 3
-    SAVE = 4
-    RESTORE = 5
-    RELEASE = 6
-    WRITE = 7
-    READ = 8
-    SAVE_STATES = 9
-    RESTORE_STATES = 10
-    COUNT_STEPS = 11
-    FAILURE = 12
-    DIFFERENTIATE = 13
-    CLOSE = 14
+    START = 2
+    READ = 3
+    WRITE = 4
+    DIFFERENTIATE = 5
+    SAVE = 6
+    RESTORE = 7
+    FAILURE = 8
+    CLOSE = 9
 
 
 class Answer(IntEnum):
-    """The codes of what workers send; the letters are those of ``native/requests.h``."""
+    """The codes of answers; the letters are those of ``native/requests.h``."""
 
-    FINE = ord("F")
-    """The step was done, and no status is worse than a warning."""
-    TROUBLE = ord("T")
-    """The step was done, and some statuses are worse than a warning."""
     RESULT = ord("R")
+    TROUBLE = ord("T")
+    """To a step: some statuses are worse than a warning. To others: the failure of an instance."""
     ERROR = ord("E")
-    """Why there is no result: a text."""
-    FAILURE = ord("X")
-    """Why there is no result: the failure of an instance."""
-    MESSAGE = ord("L")
+    """The reason why there is no result, a text."""
+    LOG = ord("L")
     """A message of the FMU, which may come at any time."""
     FAULT = ord("D")
     """The exit status of the process, which ends now. Only programs in Wine tell it."""
@@ -159,7 +150,7 @@ class Answers:
         return int(self._block.stop - self._block.start)
 
     def result(self, code: int, reader: Reader, read: Callable[[Reader], Any]) -> Any:
-        """What an answer says as ``read`` reads it, or the error that it tells.
+        """The result that ``read`` reads from an answer, or the error that it tells.
 
         Raises:
             DamagedError: If it is no answer.
@@ -168,7 +159,7 @@ class Answers:
             return read(reader)
         if code == Answer.ERROR:
             return SimulationError(reader.text())
-        if code == Answer.FAILURE:
+        if code == Answer.TROUBLE:
             return SimulationError(self.failure(reader, reader.index(self.count)))
         raise DamagedError(f"the code {code}")
 
@@ -220,14 +211,19 @@ def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
     return Writer().listing(variables, version).form()
 
 
-def request_save_states(indices: IndexArray, records: bool) -> bytes:
-    """Save states; see ``SavingPool.save_states``."""
-    return Writer().array(indices, np.int64).integers(records).form()
+def request_save(
+    indices: IndexArray, records: bool, snapshot: int = NO_SNAPSHOT, dropped: Sequence[int] = ()
+) -> bytes:
+    """Save states or records as values, or in a new snapshot; some others are dropped before."""
+    writer = Writer().array(indices, np.int64).integers(records, snapshot)
+    return writer.array(dropped, np.int64).form()
 
 
-def request_restore_states(states: Sequence[bytes], indices: IndexArray) -> bytes:
-    """Restore states; see ``SavingPool.restore_states``."""
-    writer = Writer().array(indices, np.int64)
+def request_restore(
+    states: Sequence[bytes], indices: IndexArray, snapshot: int = NO_SNAPSHOT
+) -> bytes:
+    """Restore states, or those of a snapshot."""
+    writer = Writer().array(indices, np.int64).integers(snapshot)
     for state in states:
         writer.block(state)
     return writer.form()

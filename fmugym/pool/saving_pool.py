@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
-import weakref
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
-from itertools import compress
-from typing import Any
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,15 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
-from fmugym.pool.bundle import Bundle, Copies, IndexArray, SaveMethod, head_of, outputs_of
+from fmugym.pool.bundle import (
+    Bundle,
+    Copies,
+    IndexArray,
+    SaveMethod,
+    Snapshot,
+    head_of,
+    outputs_of,
+)
 from fmugym.pool.recorded_inputs import RecordedInputs, inputs_in
 from fmugym.pool.retrying import RetryingPool
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -56,6 +63,8 @@ class SavingPool(RetryingPool):
     def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> None:
         """Take over what saving needs."""
         self._form = description, spec
+        self._numbers: Iterator[int] = itertools.count(1)
+        self._dropped: deque[int] = deque()
         self._offered = offered_method(description, spec)
 
     def save_by(self, ask_for_method: Callable[[], SaveMethod]) -> None:
@@ -87,7 +96,7 @@ class SavingPool(RetryingPool):
         if np.any(self.statuses > WARNING_CODE):
             return None
         try:
-            return Copies(weakref.ref(self), self._copy_all(), np.array(indices))
+            return Copies(self.save(), np.array(indices))
         except SimulationError:  # an episode has ended in another way
             return None
 
@@ -99,8 +108,8 @@ class SavingPool(RetryingPool):
         if bundle.replays:
             there = self._restore_copies(bundle, sources, indices)
             there |= [not head_of(state).is_record for state in states]
-            self._replay(list(compress(states, ~there)), indices[~there])
-            states, indices = tuple(compress(states, there)), indices[there]
+            self._replay(list(itertools.compress(states, ~there)), indices[~there])
+            states, indices = tuple(itertools.compress(states, there)), indices[there]
         elif self.save_method is not SaveMethod.STATE:
             raise SimulationError(
                 "the snapshot has serialized FMU states, which do not work in this pool"
@@ -126,20 +135,31 @@ class SavingPool(RetryingPool):
 
     # Copies
 
-    @abstractmethod
-    def save(self) -> Any:
+    def save(self) -> Snapshot:
         """Copy the FMU states and times of all instances.
 
         Returns:
-            A snapshot for ``restore`` of the same pool. It is freed with its last reference.
+            A snapshot for ``restore`` of the same pool. After its last reference it is freed with
+            the next call of ``save``.
 
         Raises:
             SimulationError: If the FMU offers no state, or an instance cannot save it now.
         """
+        number = next(self._numbers)
+        dropped = [self._dropped.popleft() for _ in range(len(self._dropped))]
+        try:
+            self._save_snapshot(number, dropped)
+        except BaseException:  # some workers may have saved
+            self._dropped.extend((number, *dropped))
+            raise
+        return Snapshot(self, number, self._dropped)
 
     @abstractmethod
+    def _save_snapshot(self, number: int, dropped: Sequence[int]) -> None:
+        """Save all instances in a new snapshot, and free the dropped ones; all are numbers."""
+
     def restore(
-        self, snapshot: Any, mask: MaskArray | None = None
+        self, snapshot: Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """Return instances to a snapshot.
 
@@ -153,10 +173,14 @@ class SavingPool(RetryingPool):
         Raises:
             SimulationError: If the snapshot is of another pool, or an instance was replaced since.
         """
+        if not isinstance(snapshot, Snapshot) or snapshot.pool() is not self:
+            raise SimulationError("the snapshot was taken from another pool")
+        self._restore_snapshot(snapshot.number, self._as_mask(mask))
+        return self.outputs, self.statuses
 
-    def _copy_all(self) -> Any:
-        """Copy all states as ``save`` does, but in a way that lets instances be replaced."""
-        return self.save()
+    @abstractmethod
+    def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
+        """Restore the instances in the mask."""
 
     def _restore_copies(
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
@@ -166,7 +190,7 @@ class SavingPool(RetryingPool):
         No instance may have been replaced since.
         """
         own, copies = np.zeros(len(indices), np.bool_), bundle.copies
-        if copies is None or copies.pool() is not self:
+        if copies is None or copies.snapshot.pool() is not self:
             return own
         mask = np.zeros(self.num_instances, np.bool_)
         own = copies.indices[sources] == indices

@@ -87,7 +87,6 @@ PyMODINIT_FUNC PyInit__native(void) {
     if (!handlers_prepare() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
-        !add_type(module, &snapshot_type, &snapshot_spec) ||
         PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {
         Py_DECREF(module);
         return NULL;

@@ -144,6 +144,17 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return give_up(&c);
 }
 
+static void do_count_steps(PyPool *self, bool alone, void *context) {
+    (void)alone;
+    (void)context;
+    pool_count_steps(&self->pool);
+}
+
+PyObject *py_count_steps(PyObject *object, PyObject *unused) {
+    (void)unused;
+    return perform((PyPool *)object, NEVER_SHORT, do_count_steps, NULL) ? Py_NewRef(Py_None) : NULL;
+}
+
 /* What is asked for besides steps and resets: see ../requests.h. */
 
 typedef struct {
@@ -216,7 +227,7 @@ static PyObject *answer_of(const Asking *a) {
     if (writer->failed) {
         return PyErr_NoMemory();
     }
-    return a->request == REQUEST_SAVE_STATES && a->answer == ANSWER_RESULT
+    return a->request == REQUEST_SAVE && a->answer == ANSWER_RESULT
                ? Py_BuildValue("iN", (int)a->answer, tuple_of(writer))
                : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }

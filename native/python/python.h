@@ -25,11 +25,6 @@ typedef struct {
 } PyDraws;
 
 typedef struct {
-    PyObject_HEAD Snapshot *snapshot;
-    PyObject *pool; /* keeps the memory of the pool alive, but not its instances */
-} PySnapshot;
-
-typedef struct {
     PyObject_HEAD Pool pool;
     bool opened;         /* whether the pool may need closing */
     int calls_python;    /* whether the FMU's code is Python, in which signals must not end up */
@@ -41,8 +36,8 @@ typedef struct {
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
 } PyPool;
 
-extern PyTypeObject *access_type, *draws_type, *snapshot_type;
-extern PyType_Spec access_spec, draws_spec, snapshot_spec, pool_spec;
+extern PyTypeObject *access_type, *draws_type;
+extern PyType_Spec access_spec, draws_spec, pool_spec;
 
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
@@ -78,8 +73,7 @@ PyObject *py_step_own(PyObject *object, PyObject *unused);
 PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_ask(PyObject *object, PyObject *args);
-PyObject *py_save(PyObject *object, PyObject *unused);
-PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_count_steps(PyObject *object, PyObject *unused);
 
 /* A function of the module */
 PyObject *py_seed(PyObject *module, PyObject *args);

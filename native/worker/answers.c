@@ -29,7 +29,7 @@ static void send_record(Worker *w, size_t index, int status, const char *categor
     write_integer(&writer, status);
     write_text(&writer, category);
     write_text(&writer, text);
-    send_answer(w, MESSAGE_OF_FMU, &writer);
+    send_answer(w, ANSWER_LOG, &writer);
 }
 
 void worker_report(Worker *w) {
@@ -66,10 +66,8 @@ void worker_publish(Worker *w) {
     if (!channel_is_open(&w->channel)) {
         return;
     }
-    for (size_t i = 0; i < s->outputs->count; i++) {
-        memcpy(shared->outputs + i * shared->stride, w->output_values + i * s->count,
-               s->count * sizeof(double));
-    }
+    pool_count_steps(&w->pool);
+    memcpy(shared->outputs, w->output_values, s->outputs->count * s->count * sizeof(double));
     memcpy(shared->observations, w->observations, s->count * s->num_observed * sizeof(float));
     memcpy(shared->statuses, w->statuses, s->count);
 }

@@ -15,7 +15,7 @@ static Worker worker; /* the settings point into it */
 static LONG WINAPI tell_of_fault(EXCEPTION_POINTERS *fault) {
     const int64_t code = fault->ExceptionRecord->ExceptionCode;
 
-    send_message(&worker.channel, MESSAGE_OF_FAULT, &code, sizeof code);
+    send_message(&worker.channel, ANSWER_FAULT, &code, sizeof code);
     TerminateProcess(GetCurrentProcess(), (UINT)code);
     return EXCEPTION_EXECUTE_HANDLER;
 }

@@ -104,31 +104,31 @@ static const char *load_all_before(Reader *reader, char *error, size_t size) {
     return fault;
 }
 
-/* Where an array of so many items begins, of which this worker has those from first on. */
-static void *place(Reader *reader, const Shared *shared, size_t item, size_t first, size_t items) {
+/* Where an array of so many items begins. */
+static void *place(Reader *reader, const Shared *shared, size_t item, size_t items) {
     const size_t size = item * items;
     const int64_t offset = read_integer_in(reader, 0, (int64_t)shared->size);
 
     if (offset % 8 != 0 || size > shared->size - (size_t)offset) {
         reader_refuse(reader, "an array is outside of the shared memory");
     }
-    return shared->base + offset + item * first;
+    return shared->base + offset;
 }
 
-static void read_places(Worker *w, Reader *reader, size_t first) {
+static void read_places(Worker *w, Reader *reader) {
     Shared *shared = &w->shared;
     const Settings *s = &w->opening.settings;
-    const size_t n = shared->stride;
+    const size_t n = s->count;
 
-    shared->inputs = place(reader, shared, sizeof(double), first, s->inputs->count * n);
-    shared->outputs = place(reader, shared, sizeof(double), first, s->outputs->count * n);
-    shared->observations = place(reader, shared, sizeof(float) * s->num_observed, first, n);
-    shared->statuses = place(reader, shared, 1, first, n);
-    shared->mask = place(reader, shared, 1, first, n);
-    shared->health = place(reader, shared, sizeof(int64_t) * HEALTH_COUNTS, first, n);
+    shared->inputs = place(reader, shared, sizeof(double), s->inputs->count * n);
+    shared->outputs = place(reader, shared, sizeof(double), s->outputs->count * n);
+    shared->observations = place(reader, shared, sizeof(float), s->num_observed * n);
+    shared->statuses = place(reader, shared, 1, n);
+    shared->mask = place(reader, shared, 1, n);
+    shared->health = place(reader, shared, sizeof(int64_t), HEALTH_COUNTS * n);
     const size_t echo_size = (size_t)read_integer_in(reader, 8, UINT16_MAX);
-    char *echo = place(reader, shared, 1, 0, echo_size);
-    const Atomic *bell = place(reader, shared, sizeof(Atomic), 0, 1);
+    char *echo = place(reader, shared, 1, echo_size);
+    const Atomic *bell = place(reader, shared, sizeof(Atomic), 1);
     if (reader->fault == NULL) {
         log_echo_to(echo, echo_size);
         w->channel.bell = bell;
@@ -138,12 +138,9 @@ static void read_places(Worker *w, Reader *reader, size_t first) {
 
 static const char *open_shared(Worker *w, Reader *reader) {
     Shared *shared = &w->shared;
-    const size_t count = w->opening.settings.count;
     const char *name = read_text(reader);
 
     shared->size = (size_t)read_integer_in(reader, 0, PTRDIFF_MAX);
-    shared->stride = (size_t)read_integer_in(reader, (int64_t)count, INT32_MAX);
-    const size_t first = (size_t)read_integer_in(reader, 0, (int64_t)(shared->stride - count));
     if (reader->fault != NULL) {
         return reader->fault;
     }
@@ -151,7 +148,7 @@ static const char *open_shared(Worker *w, Reader *reader) {
     if (shared->base == NULL) {
         return "the shared memory cannot be mapped";
     }
-    read_places(w, reader, first);
+    read_places(w, reader);
     return reader->fault;
 }
 
@@ -171,11 +168,7 @@ static const char *allocate(Worker *w) {
 /* The outputs of the worker before, as long as nothing else is known. */
 static void take_over_outputs(Worker *w) {
     const Settings *s = &w->opening.settings;
-
-    for (size_t i = 0; i < s->outputs->count; i++) {
-        memcpy(w->output_values + i * s->count, w->shared.outputs + i * w->shared.stride,
-               s->count * sizeof(double));
-    }
+    memcpy(w->output_values, w->shared.outputs, s->outputs->count * s->count * sizeof(double));
 }
 
 /* Unseeded random numbers are the same in all workers otherwise. */

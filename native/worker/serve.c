@@ -6,22 +6,28 @@
 
 static const size_t LARGEST_REQUEST = (size_t)1 << 40; /* bytes; no memory is as large */
 
-static void answer_step(Worker *w, bool some) {
-    Call call = {.inputs = shared_inputs(w), .observations = w->observations};
+/* Whether an instance has a status worse than a warning, be it in the mask or not. */
+static bool is_troubled(const Worker *w) {
+    bool troubled = false;
+
+    for (size_t i = 0; i < w->opening.settings.count; i++) {
+        troubled |= w->statuses[i] > STATUS_WARNING;
+    }
+    return troubled;
+}
+
+static void answer_step(Worker *w) {
+    const Call call = {.inputs = shared_inputs(w),
+                       .mask = {w->shared.mask, 1},
+                       .observations = w->observations};
     Writer nothing = {.bytes = NULL};
 
-    if (some) {
-        call.mask = (Mask){w->shared.mask, 1};
-    }
     pool_enter(&w->pool);
-    bool troubled = pool_step(&w->pool, &call) > 0;
+    pool_step(&w->pool, &call);
     pool_leave(&w->pool);
-    for (size_t i = 0; some && !troubled && i < w->opening.settings.count; i++) {
-        troubled = w->statuses[i] > STATUS_WARNING; /* also of those in the mask */
-    }
     worker_report(w);
     worker_publish(w);
-    send_answer(w, troubled ? ANSWER_TROUBLE : ANSWER_FINE, &nothing);
+    send_answer(w, is_troubled(w) ? ANSWER_TROUBLE : ANSWER_RESULT, &nothing);
 }
 
 static Answer answer_close(Worker *w) {
@@ -30,35 +36,28 @@ static Answer answer_close(Worker *w) {
 }
 
 static Answer answer_in_pool(Worker *w, Request request, Reader *reader, Writer *writer) {
-    return request == REQUEST_RESET     ? answer_reset(w, reader, writer)
-           : request == REQUEST_SAVE    ? answer_save(w, reader, writer)
-           : request == REQUEST_RESTORE ? answer_restore(w, reader, writer)
-           : request == REQUEST_RELEASE ? answer_release(w, reader)
-           : request == REQUEST_CLOSE
-               ? answer_close(w)
-               : pool_answer(&w->pool, shared_inputs(w), request, reader, writer);
+    return request == REQUEST_START   ? answer_start(w, reader, writer)
+           : request == REQUEST_CLOSE ? answer_close(w)
+                                      : pool_answer(&w->pool, shared_inputs(w), request, reader,
+                                                    writer);
 }
 
 static void answer_other(Worker *w, Request request, Reader *reader) {
-    const bool changes = request == REQUEST_RESET || request == REQUEST_RESTORE ||
-                         request == REQUEST_RESTORE_STATES;
     Writer writer = {.bytes = NULL};
 
     pool_enter(&w->pool);
     const Answer answer = answer_in_pool(w, request, reader, &writer);
     pool_leave(&w->pool);
     worker_report(w);
-    if (changes) {
+    if (request == REQUEST_START || request == REQUEST_RESTORE) {
         worker_publish(w);
     }
-    if (request != REQUEST_RELEASE) {
-        send_answer(w, answer, &writer);
-    }
+    send_answer(w, answer, &writer);
 }
 
 static void answer(Worker *w, Request request, Reader *reader) {
-    if (request == REQUEST_STEP || request == REQUEST_STEP_SOME) {
-        answer_step(w, request == REQUEST_STEP_SOME);
+    if (request == REQUEST_STEP) {
+        answer_step(w);
     } else {
         answer_other(w, request, reader);
     }

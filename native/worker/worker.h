@@ -7,15 +7,15 @@
 #include "../requests.h"
 #include "frames.h"
 
-/* The arrays that the process shares with its parent; see fmugym/pool/process/shared_memory.py. Rows
- * of inputs and outputs are stride elements apart, and the others have no gaps. */
+/* The arrays that the process shares with its parent; see fmugym/pool/process/shared_memory.py. They have
+ * no gaps. */
 typedef struct {
     char *base;
-    size_t size, stride;
+    size_t size;
     double *inputs, *outputs;
     float *observations;
     int8_t *statuses;
-    const char *mask;
+    const char *mask; /* the instances that a step leaves out, or that a start starts */
     int64_t *health;
 } Shared;
 
@@ -38,8 +38,6 @@ typedef struct {
     int8_t *statuses;
     List *lists;
     size_t number_of_lists;
-    Snapshot **snapshots; /* NULL for those that were freed */
-    size_t number_of_snapshots;
     int64_t resets;       /* of single instances */
     int64_t first_memory; /* bytes of the process after the first resets; 0 before */
 } Worker;
@@ -51,11 +49,8 @@ void worker_serve(Worker *worker);
  * told why. */
 bool answer_open(Worker *worker, Reader *reader);
 
-/* The answers to requests that are not those of the pool itself, inside of it. */
-Answer answer_reset(Worker *worker, Reader *reader, Writer *writer);
-Answer answer_save(Worker *worker, Reader *reader, Writer *writer);
-Answer answer_restore(Worker *worker, Reader *reader, Writer *writer);
-Answer answer_release(Worker *worker, Reader *reader);
+/* Starts episodes, inside of the pool. */
+Answer answer_start(Worker *worker, Reader *reader, Writer *writer);
 
 /* Passes on the messages of the FMUs. */
 void worker_report(Worker *worker);

@@ -178,23 +178,14 @@ class TestAtOnce:
         self.interrupted(call)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
-    def test_the_end_of_a_snapshot(self, fmu):
+    def test_the_end_of_a_pool(self, fmu):
         pool = pool_tools.open_pool(FMU(fmu), ("u",), ("y",), n=2)
         pool_tools.start(pool)
-        snapshots = [pool.save()]
-        self.interrupted(snapshots.clear)
-        assert not pool.step()[1].any()
-        pool.close()
-
-    def test_the_end_of_a_snapshot_when_python_ends(self, fmu, monkeypatch):
-        """The module threading has lost its names then."""
-        pool = pool_tools.open_pool(FMU(fmu), ("u",), ("y",))
-        pool_tools.start(pool)
-        snapshots = [pool.save()]
-        with monkeypatch.context() as patch:
-            patch.setattr(threading, "_main_thread", None)
-            snapshots.clear()
-        pool.close()
+        pool._close.detach()
+        left = [pool._pool]
+        del pool
+        self.interrupted(left.clear)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_a_handler_that_returns_lets_the_episode_go_on(make, raised):

@@ -291,7 +291,7 @@ class Noise:
         def receive_odd_head(channel, deadline):
             code, size = head(channel, deadline)
             if self.hits("answer") and self.rng.random() < 0.3:
-                code = self.rng.choice((code, *b"FTRXELD", 0, 2**40))
+                code = self.rng.choice((code, *b"RTELD", 0, 2**40))
                 size += self.rng.choice((0, 0, 8, 2**40))
             return code, size
 

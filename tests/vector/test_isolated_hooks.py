@@ -185,7 +185,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
     nothing = _native.Access(form_of_listing(()))
     assert around.reset(nothing, np.zeros((0, 3)), None, None) == 3
     code, answer = around.ask(Request.READ, request_listing((), 2))
-    assert code == Answer.FAILURE
+    assert code == Answer.TROUBLE
     assert answer[:8] == bytes(8)
     np.testing.assert_array_equal(envs.pool.outputs, before)
     around.close()

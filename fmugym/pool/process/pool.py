@@ -41,11 +41,11 @@ from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
-from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
+from fmugym.pool.process.states import StatesOfWorkers
 from fmugym.pool.process.supervisor import A_STEP, INTERRUPTED, RESET, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.reports import REFUSED_ANEW
-from fmugym.pool.requests import Answer, Reader, Request, request_listing
+from fmugym.pool.requests import Answer, Reader, Request, request_listing, request_restore
 from fmugym.pool.spec import ResetMethod
 
 __all__ = ["ProcessPool"]
@@ -166,14 +166,14 @@ class ProcessPool(AskingPool):
         used = {s for s in supervisors if not s.is_new}
         kills = {s: s.kills for s in supervisors}
         alive = self._group.revive(supervisors)
+        np.copyto(self._mask, mask)
 
         def tell(supervisor: Supervisor) -> None:
-            block, writer = supervisor.block, Writer().block(listing)
-            writer.array(values[:, block], np.float64).array(mask[block], np.bool_)
+            content = Writer().block(listing).array(values[:, supervisor.block], np.float64).form()
             supervisor.forget_output()
             if texts:
                 supervisor.lend(texts)
-            supervisor.tell(Request.RESET, writer.form(), supervisor.read_growth)
+            supervisor.tell(Request.START, content, supervisor.read_growth)
 
         for supervisor in self._group.run(RESET, alive, tell):
             supervisor.note_success()
@@ -244,13 +244,10 @@ class ProcessPool(AskingPool):
             return self._step(None)
 
     def _step(self, skip: MaskArray | None) -> int:
-        request = Request.STEP
-        if skip is not None or self._group.any_lost:
-            request = Request.STEP_SOME
-            np.logical_or(self._group.lost, False if skip is None else skip, out=self._mask)
-        replies = self._group.run(
-            A_STEP, self._group.able, lambda supervisor: supervisor.step(request)
-        )
+        np.copyto(self._mask, self._group.lost)
+        if skip is not None:
+            np.logical_or(self._mask, skip, out=self._mask)
+        replies = self._group.run(A_STEP, self._group.able, Supervisor.step)
         if not self._group.any_lost and Answer.TROUBLE not in replies.values():
             return 0
         self._group.note_lost()
@@ -264,35 +261,27 @@ class ProcessPool(AskingPool):
 
         return play_around(self, self._spec, variables, *parts)
 
-    def save(self) -> SnapshotOfWorkers:
-        """See ``SavingPool.save``."""
-        with self._lock:
-            self._require_present()
-            snapshot = self._states.save()
-            self._require_present()
-            return snapshot
+    def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
+        """See ``SavingPool._restore_snapshot``; a state is lost with the process that saved it."""
 
-    def restore(
-        self, snapshot: SnapshotOfWorkers, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``SavingPool.restore``; a state is lost with the process that saved it."""
-        mask = self._as_mask(mask)
-        self._states.require_own(snapshot)
+        def tell(supervisor: Supervisor) -> None:
+            indices = np.flatnonzero(mask[supervisor.block])
+            supervisor.tell(Request.RESTORE, request_restore((), indices, number))
+
         with self._lock:
             self._require_present(mask)
-            self._states.restore(snapshot, mask)
-        return self.outputs, self.statuses
+            self._group.run("restoring a state", self._group.of_any(mask), tell)
+            self._group.note_lost()
 
     def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
         """See ``SavingPool.save_states``; the episodes of lost instances have ended."""
         with self._lock:
-            start_time = self._spec.start_time
-            return self._states.save_states(indices, records, start_time, self.outputs)
+            return self._states.save(indices, records, self._spec.start_time, self.outputs)
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
         """See ``SavingPool.restore_states``; a lost worker is replaced."""
         with self._lock:
-            self._states.restore_states(states, indices)
+            self._states.restore(states, indices)
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
@@ -300,29 +289,20 @@ class ProcessPool(AskingPool):
             supervisor = self._group.of(index)
             if not self._group.lost[index]:
                 within, tell = index - supervisor.block.start, supervisor.answers.failure
-                content = Writer().integers(within).form()
-                for text in self._answers(
-                    [supervisor], Request.FAILURE, content, lambda reader: tell(reader, within)
-                ):
+                question = Writer().integers(within).form(), lambda reader: tell(reader, within)
+                replies = self._group.run(
+                    "a question", [supervisor], lambda s: s.tell(Request.FAILURE, *question)
+                )
+                for text in replies.values():
                     if text or self.statuses[index] <= WARNING_CODE:
                         return f"{text}{supervisor.printed}"
             return supervisor.reason or INTERRUPTED
 
-    def _answers(self, supervisors: Sequence[Supervisor], *question: Any) -> list[Any]:
-        """Ask workers for what takes no time; see ``Supervisor.tell``."""
-        replies = self._group.run("a question", supervisors, lambda s: s.tell(*question))
-        return list(replies.values())
-
     def _count_steps(self) -> None:
-        """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
+        """See ``CountedPool``; workers count in the memory that they share."""
         with self._lock:
-            if not self._group.refusal:
-                self._answers(self._group.able, Request.COUNT_STEPS)
-            self._take_counts()
-
-    def _take_counts(self) -> None:
-        for supervisor in self._group.supervisors:
-            supervisor.take_counts()
+            for supervisor in self._group.supervisors:
+                supervisor.take_counts()
 
     def forget_health(self) -> None:
         """See ``Pool.forget_health``."""
@@ -338,7 +318,7 @@ class ProcessPool(AskingPool):
     def info(self) -> dict[str, npt.NDArray[Any]]:
         """See ``Pool.info``."""
         if self._spec.fault_retries:
-            self._take_counts()
+            self._count_steps()
         return super().info()
 
     def _ask(

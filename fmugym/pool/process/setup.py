@@ -226,9 +226,8 @@ class Setup:
         """Name the memory on Windows, and in Wine by this process's descriptor of it."""
         path = windows_path(Path("/proc", str(os.getpid()), "fd", str(memory.descriptor)))
         writer.text(os.fsencode(path if self.wine is not None else memory.tag))
-        writer.integers(memory.size, self.count, 0)
         *arrays, echo, bell = memory.offsets
-        writer.integers(*arrays, ECHO_SIZE, echo, bell)
+        writer.integers(memory.size, *arrays, ECHO_SIZE, echo, bell)
 
 
 def _emptied(folder: Path) -> Path:

@@ -9,17 +9,13 @@ import os
 import signal
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
-import numpy as np
-
 from fmugym.errors import FMULoadError, printable
 from fmugym.fmi.words import as_messages, quoted
-from fmugym.pool.form import Writer
 from fmugym.pool.health import Arrays
 from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.guard import LONGEST_START
@@ -72,7 +68,7 @@ _LONGEST_KILL: Final = 2.0
 _GIVEN_UP: Final = "ended with exit status 1"
 """What Wine does if it gets no server."""
 
-_STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
+_STEPPED: Final = (Answer.RESULT, Answer.TROUBLE)
 
 
 def timeout_factor(doing: str) -> int:
@@ -124,12 +120,10 @@ class Supervisor:
     Attributes:
         block: The indices of the worker's instances.
         answers: Reads the worker's answers.
-        generation: The number of processes that have ended.
         reason: Why the last process died.
         growth: By how many bytes the process has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
         is_busy: Whether a reply is due.
-        released: The snapshots without any reference left, by generation and number.
         receiver: Gets the messages of the worker's FMUs.
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
         initializations: How many initializations its processes have begun.
@@ -148,13 +142,11 @@ class Supervisor:
     ) -> None:
         self.block = setup.block
         self.answers = Answers(setup.description, setup.spec, setup.block)
-        self.generation = 0
         self.reason = ""
         self.losses: list[Loss] = []
         self.initializations = self.kills = 0
         self.growth = 0
         self.is_new = True
-        self.released: deque[tuple[int, int]] = deque()
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
@@ -303,7 +295,6 @@ class Supervisor:
     def _forget_process(self, reason: str) -> None:
         self.forget()
         self._opening = self.is_busy = False
-        self.generation += 1
         self._deaths += 1
         gone = self._deaths >= _MOST_DEATHS
         prefix = f"given up after {self._deaths} deaths in a row: " if gone else ""
@@ -350,14 +341,12 @@ class Supervisor:
 
     # Requests and replies.
 
-    def step(self, request: Request) -> None:
+    def step(self) -> None:
         """Ask the worker to step; failures show in the reply."""
         self.is_busy, self._asked, self._read = True, time.monotonic(), None
         self._copies.give_for_step()
         try:
-            if self.released:
-                self._release()
-            self._channel.send(request, deadline=self.deadline)
+            self._channel.send(Request.STEP, deadline=self.deadline)
         except OSError:  # "Ignoring" takes longer
             return
 
@@ -378,8 +367,6 @@ class Supervisor:
         self._copies.give()
         self._output.pump()
         with suppress(OSError):
-            if self.released:
-                self._release()
             self._channel.send(request, content, self.deadline)
 
     def lend(self, texts: Sequence[str]) -> None:
@@ -397,13 +384,6 @@ class Supervisor:
         self._output.drain()
         return quoted(as_messages(self._output.lines()), "it printed")
 
-    def _release(self) -> None:
-        generation, numbers = self.generation, []
-        while self.released:
-            owner, number = self.released.popleft()
-            numbers += [number] if owner == generation else []
-        self._channel.send(Request.RELEASE, Writer().array(numbers, np.int64).form(), self.deadline)
-
     def reply(self, deadline: float, doing: str) -> Any:
         """Wait for the reply.
 
@@ -412,7 +392,7 @@ class Supervisor:
             doing: What the worker does, for the cause of a death.
 
         Returns:
-            ``Answer.FINE`` or ``Answer.TROUBLE`` for a step; the result; or a ``SimulationError``.
+            ``Answer.RESULT`` or ``TROUBLE`` for a step; the result; or a ``SimulationError``.
 
         Raises:
             LostError: If the worker has died or is late.
@@ -468,7 +448,7 @@ class Supervisor:
             if self._channel.wait(left):
                 try:
                     code, size = self._channel.receive_head(deadline)
-                    if read is None and code in _STEPPED:
+                    if read is None and not size and code in _STEPPED:
                         return code
                     result = self._take(code, self._channel.receive_content(size, deadline), read)
                 except LateError:
@@ -487,7 +467,7 @@ class Supervisor:
     ) -> tuple[Any] | None:
         """Take a message; returns the answer to the request if it is one."""
         reader = Reader(content)
-        if code == Answer.MESSAGE:
+        if code == Answer.LOG:
             self._pass_on(reader)
         elif code == Answer.FAULT:
             self._fault = reader.integer()

@@ -68,7 +68,7 @@ def flood(worker):
     """Messages without an end, in the place of an answer."""
     message = struct.pack("=qq", 0, 0) + text("info") + text("more")
     while True:
-        worker.send(Answer.MESSAGE, message)
+        worker.send(Answer.LOG, message)
 
 
 def promise(worker):
@@ -81,7 +81,7 @@ def promise(worker):
 def pretend(worker):
     """An instance that does not exist has failed."""
     worker.read()
-    worker.send(Answer.FAILURE, struct.pack("=qq", 7, 0))
+    worker.send(Answer.TROUBLE, struct.pack("=qq", 7, 0))
     time.sleep(10.0)
 
 
@@ -135,7 +135,7 @@ def test_a_request_that_nobody_reads(deceived):
 
 
 def test_opening_is_answered_by_nothing_else(deceived, monkeypatch):
-    monkeypatch.setattr(Impostor, "_run", lambda self, _: self.send(Answer.FINE))
+    monkeypatch.setattr(Impostor, "_run", lambda self, _: self.send(Answer.TROUBLE))
     with pytest.raises(FMULoadError, match="has sent what is no answer in the instantiation"):
         deceived(None)
 

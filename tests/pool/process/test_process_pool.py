@@ -357,7 +357,7 @@ class TestKilledFromOutside:
 
         return killing
 
-    @pytest.mark.parametrize("request_", [Request.OPEN, Request.RESET])
+    @pytest.mark.parametrize("request_", [Request.OPEN, Request.START])
     def test_others_go_on(self, faulty, make_envs, killing, request_):
         """One episode of a vector environment ends, and the next one begins."""
         envs = make_envs(lambda: FaultyEnv(faulty), 3, workers=3)
@@ -374,7 +374,7 @@ class TestKilledFromOutside:
 
     def test_not_for_ever(self, faulty, make_env, killing):
         env = make_env()
-        killing(Request.RESET, 100)
+        killing(Request.START, 100)
         with pytest.raises(SimulationError, match=r"given up after 5 deaths in a row: .*SIGKILL"):
             env.reset()
 
@@ -512,7 +512,7 @@ class TestPool:
         with pytest.raises(SimulationError, match="SIGSEGV"):
             pool.save()
         set_up(pool, faulty, ["none", "none"])
-        with pytest.raises(SimulationError, match=r"process has been replaced since: .*SIGSEGV"):
+        with pytest.raises(SimulationError, match="has been replaced since"):
             pool.restore(snapshot)
         outputs, _ = pool.restore(snapshot, np.array([False, True]))
         assert outputs[0].tolist() == [0.0, 0.5]

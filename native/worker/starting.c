@@ -1,4 +1,4 @@
-/* The answer to requests for resets. */
+/* Starts of episodes. */
 
 #include <stdlib.h>
 #include <string.h>
@@ -46,11 +46,11 @@ static int64_t memory_of_process(void) {
 }
 
 /* By how many bytes the process has grown since its first resets. */
-static int64_t growth_after(Worker *w, const char *mask) {
+static int64_t growth_after_start(Worker *w) {
     const size_t count = w->opening.settings.count;
 
     for (size_t i = 0; i < count; i++) {
-        w->resets += mask[i] != 0;
+        w->resets += w->shared.mask[i] != 0;
     }
     if (w->resets < FIRST_RESETS * (int64_t)count) {
         return 0;
@@ -61,8 +61,8 @@ static int64_t growth_after(Worker *w, const char *mask) {
 }
 
 Matrix shared_inputs(const Worker *w) {
-    return (Matrix){(const char *)w->shared.inputs, (ptrdiff_t)(w->shared.stride * sizeof(double)),
-                    sizeof(double)};
+    return (Matrix){(const char *)w->shared.inputs,
+                    (ptrdiff_t)(w->opening.settings.count * sizeof(double)), sizeof(double)};
 }
 
 static const Access *known_list(const Worker *w, Block form) {
@@ -75,7 +75,7 @@ static const Access *known_list(const Worker *w, Block form) {
     return NULL;
 }
 
-/* The list of a reset, which stays: states of instances belong to it. */
+/* The list of a start, which stays: states of instances belong to it. */
 static const Access *find_list(Worker *w, Reader *reader) {
     const Block form = read_block(reader);
     const Access *known = reader->fault == NULL ? known_list(w, form) : NULL;
@@ -110,22 +110,18 @@ static Matrix read_values(Worker *w, Reader *reader, const Access *access) {
     return (Matrix){(const char *)first, (ptrdiff_t)(n * sizeof(double)), sizeof(double)};
 }
 
-Answer answer_reset(Worker *w, Reader *reader, Writer *writer) {
+Answer answer_start(Worker *w, Reader *reader, Writer *writer) {
     const Access *start = find_list(w, reader);
     const Matrix values = read_values(w, reader, start);
-    const Block mask = read_block(reader);
     const Call call = {.inputs = shared_inputs(w),
                        .start = start,
                        .start_values = values,
-                       .mask = {mask.bytes, 1},
+                       .mask = {w->shared.mask, 1},
                        .observations = w->observations};
 
-    if (mask.size != w->opening.settings.count) {
-        reader_refuse(reader, "a mask has another length");
-    }
     if (reader->fault == NULL) {
         pool_reset(&w->pool, &call);
-        write_integer(writer, growth_after(w, mask.bytes));
+        write_integer(writer, growth_after_start(w));
         write_integer(writer, (int64_t)number_of_initializations());
     }
     return answer_after(&w->pool, reader, writer, -1);
