@@ -19,8 +19,8 @@ __all__ = [
     "Bundle",
     "Copies",
     "Head",
+    "InstanceSnapshot",
     "SaveMethod",
-    "Snapshot",
     "ended_state",
     "head_of",
     "outputs_of",
@@ -103,7 +103,7 @@ def surrogate_state(outputs: _FloatArray, content: bytes) -> bytes:
     return _HEAD.pack(_SURROGATE, 0, 0.0, 0, 0) + outputs.tobytes() + content
 
 
-class Snapshot:
+class InstanceSnapshot:
     """States of all instances of a pool, which the FMU has copied in its own memory.
 
     Args:
@@ -126,7 +126,7 @@ class Copies:
         indices: The instances, shape (M,).
     """
 
-    snapshot: Snapshot
+    snapshot: InstanceSnapshot
     indices: IndexArray
 
 

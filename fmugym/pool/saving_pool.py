@@ -20,8 +20,8 @@ from fmugym.pool.bundle import (
     Bundle,
     Copies,
     IndexArray,
+    InstanceSnapshot,
     SaveMethod,
-    Snapshot,
     head_of,
     outputs_of,
 )
@@ -135,7 +135,7 @@ class SavingPool(RetryingPool):
 
     # Copies
 
-    def save(self) -> Snapshot:
+    def save(self) -> InstanceSnapshot:
         """Copy the FMU states and times of all instances.
 
         Returns:
@@ -152,14 +152,14 @@ class SavingPool(RetryingPool):
         except BaseException:  # some workers may have saved
             self._dropped.extend((number, *dropped))
             raise
-        return Snapshot(self, number, self._dropped)
+        return InstanceSnapshot(self, number, self._dropped)
 
     @abstractmethod
     def _save_snapshot(self, number: int, dropped: Sequence[int]) -> None:
         """Save all instances in a new snapshot, and free the dropped ones; all are numbers."""
 
     def restore(
-        self, snapshot: Snapshot, mask: MaskArray | None = None
+        self, snapshot: InstanceSnapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """Return instances to a snapshot.
 
@@ -173,7 +173,7 @@ class SavingPool(RetryingPool):
         Raises:
             SimulationError: If the snapshot is of another pool, or an instance was replaced since.
         """
-        if not isinstance(snapshot, Snapshot) or snapshot.pool() is not self:
+        if not isinstance(snapshot, InstanceSnapshot) or snapshot.pool() is not self:
             raise SimulationError("the snapshot was taken from another pool")
         self._restore_snapshot(snapshot.number, self._as_mask(mask))
         return self.outputs, self.statuses
