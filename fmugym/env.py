@@ -376,7 +376,7 @@ class FMUEnv(Constructed):
 
     @property
     def health(self) -> dict[str, int]:
-        """Counts of what happened since the environment was made, by name.
+        """Counts of events since the environment was made, by name.
 
         ``resets``; ``steps`` (communication steps); faults by kind: ``discards``, ``errors``,
         ``fatals``, ``not_finite``, ``deaths`` (of its worker process); ``retries`` of discarded

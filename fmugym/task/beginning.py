@@ -40,7 +40,7 @@ class Beginning(ABC):
         self.pool: Pool = env._instance.pool
 
     def begin(self) -> None:
-        """Start the FMUs, and let hooks read what episodes begin with.
+        """Start the FMUs, and show hooks the first quantities of the episodes.
 
         Raises:
             SimulationError: If an FMU cannot be initialized, or its warm-up fails.
@@ -82,7 +82,7 @@ class Beginning(ABC):
 
     @abstractmethod
     def clear(self, inputs: list[Any], action: Any) -> None:
-        """Let hooks read what there is before the first step.
+        """Set the quantities of before the first step.
 
         Args:
             inputs: For each a number, or a row of shape (N,).
@@ -95,7 +95,7 @@ class Beginning(ABC):
 
     @abstractmethod
     def episodes(self, indices: IndexArray) -> Episode:
-        """What the hooks of some environments read: new arrays, environments on the last axis."""
+        """Quantities of some episodes in new arrays, environments on the last axis."""
 
     @abstractmethod
     def row(self, name: str) -> Any:

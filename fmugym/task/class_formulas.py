@@ -44,7 +44,7 @@ def with_monitors(config: EnvConfig, description: ModelDescription) -> EnvConfig
 
 
 def _listed(config: EnvConfig) -> Iterator[str]:
-    """The names of what the FMU reads, writes and starts with."""
+    """Names of the inputs, outputs, monitored variables and parameters."""
     yield from config.model_input_names
     yield from config.model_output_names
     yield from config.monitor_names

@@ -52,7 +52,7 @@ _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Constructed(Pictured):
-    """The part of ``FMUEnv`` that is done once: it makes and frees everything that a step needs.
+    """Construction of ``FMUEnv``: everything that a step needs is made and freed here.
 
     Attributes:
         interface: The variables of the config, as the FMU has them.
@@ -199,7 +199,7 @@ class Constructed(Pictured):
         self._instance = Instance(pool)
 
     def _close_pool(self) -> None:
-        """Close the pool, if one is open; hooks then read what the latest step has left."""
+        """Close the pool, if one is open; hooks then read the quantities of the latest step."""
         if self._is_open:
             self._episode, self._ended = self._episode.copy(), True
             self._compiled_step, self._has_compiled = None, False
@@ -228,7 +228,7 @@ class Constructed(Pictured):
 
     @property
     def reset_method(self) -> str:
-        """How episodes begin; see ``EnvConfig``."""
+        """Method by which episodes begin; see ``EnvConfig``."""
         return str(self._open_pool("reset_method").reset_method)
 
     def _require_fmi_version(self) -> None:
@@ -261,7 +261,7 @@ class Constructed(Pictured):
             warn_once(self.logger, f"{name} needs the tool that exported it to run")
 
     def _prepare_values(self) -> None:
-        """Set what hooks may read to what it is before the first reset."""
+        """Set the quantities to their values before the first reset."""
         interface = self.interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
         fps = min(1 / interface.time_step, _FASTEST_FPS)
@@ -437,7 +437,7 @@ def _names_of(base: type) -> frozenset[str]:
 
 
 def _require_own_names_free(cls: type[Any]) -> None:
-    """Refuse classes with attributes of their own in the places of what hooks read."""
+    """Refuse classes with attributes of their own in the places of quantities."""
     for name in READABLE:
         if getattr_static(cls, name) is not vars(Hooks)[name]:
             raise ConfigError(

@@ -119,7 +119,7 @@ class Episode:
         return result
 
     def mapped(self, each: Callable[[Any], Any]) -> Episode:
-        """The same episode with what a function makes of each value."""
+        """The same episode, with a function applied to each value."""
         variables = EpisodeVariables(self.variables)
         variables.update({name: each(value) for name, value in self.variables.items()})
         parameters = ParameterValues((n, each(value)) for n, value in self.parameters.items())
@@ -165,7 +165,7 @@ for _place, _name in enumerate(PREVIOUS):
 
 
 class NoEpisode:
-    """Stands for what hooks read as long as the constructor of ``FMUEnv`` has not made it."""
+    """Placeholder of an episode until the constructor of ``FMUEnv`` has made one."""
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(_too_early(name), name=name)

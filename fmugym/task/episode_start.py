@@ -37,7 +37,7 @@ class Draw(NamedTuple):
 
 
 class EpisodeValues(NamedTuple):
-    """The values of one episode, or rows of those of N.
+    """Start values of one episode, or rows of N start values.
 
     Attributes:
         start_values: The parameters in their order, shape (P, 1) or (P, N).

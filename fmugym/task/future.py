@@ -35,7 +35,7 @@ class Span(NamedTuple):
 
 
 def distance_of(spans: Sequence[Span]) -> float:
-    """How far the places of files lie apart in the table of a series.
+    """Distance of the places of files in the table of a series.
 
     Rows may be given from a period before a file's first one to a period after its last one. The
     distance is a power of two, so that adding it to a place rounds least.
@@ -70,7 +70,7 @@ class Lookup(NamedTuple):
 
     @property
     def table(self) -> FloatArray:
-        """What hooks look values up in now."""
+        """Table in which hooks look values up."""
         return self.tables[self.key]
 
     def mean(self, held_out: Sequence[HeldOut] = ()) -> float:
@@ -148,7 +148,7 @@ class Lookup(NamedTuple):
 
 
 class Future(NamedTuple):
-    """What an environment reads of the future.
+    """Future of an environment: its data, and its noise to come.
 
     Attributes:
         lookups: Those of the series by name.

@@ -1,4 +1,4 @@
-"""The hooks of an environment, and what they may read."""
+"""Hooks of an environment, and the quantities that they may read."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _with_copied_goals(observation: Any) -> Any:
 
 
 class AssignedHook:
-    """A hook of one environment, whatever its class: what the package assigns to the environment.
+    """Hook of one environment, which the package assigns to it, whatever its class.
 
     Args:
         call: Does what the hook does.
@@ -76,12 +76,12 @@ class AssignedHook:
         self._call = call
 
     def __call__(self) -> Any:
-        """Do what the hook does."""
+        """Call the hook."""
         return self._call()
 
 
 class Hooks(gymnasium.Env[Any, Any]):
-    """The hooks with their defaults; a subclass of ``FMUEnv`` overrides what its task needs.
+    """Hooks with their defaults; a subclass of ``FMUEnv`` overrides those of its task.
 
     ``FMUEnv`` lists what the hooks may read.
     """

@@ -1,4 +1,4 @@
-"""The writing of inputs: what ``_get_inputs`` returned becomes one number for each input."""
+"""Writer of inputs: the result of ``_get_inputs`` becomes one number for each input."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ __all__ = ["Instance"]
 
 
 class Instance:
-    """The FMU instance of an environment: what a step needs of the pool that it is in.
+    """FMU instance of an environment: its rows and calls in a pool.
 
     Args:
         pool: A pool of one; or one of N, whose vector environment then steps it.

@@ -213,7 +213,7 @@ class Interface:
 
 
 def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
-    """Look up all names in the FMU, and take from the FMU what the config leaves open.
+    """Look up all names in the FMU, which completes the config.
 
     Raises:
         ConfigError: If a name is unknown, or its variable cannot be used in that role.
@@ -267,7 +267,7 @@ def _resolved(
 
 
 def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
-    """Find what can be read after every step: scalars, and all elements of arrays.
+    """Find variables that can be read after every step: scalars, and all elements of arrays.
 
     Raises:
         ConfigError: If there is no variable of a name, one is named twice, or its value is no
@@ -298,7 +298,7 @@ def _by_scalar(
     allowed: Sequence[Variable],
     kind: str,
 ) -> dict[str, _Value]:
-    """Spread what is given for arrays and elements; what is given for an element counts more.
+    """Spread values of arrays over their elements; a value of an element itself counts more.
 
     Raises:
         ConfigError: If a name is not that of any of the allowed variables.

@@ -113,7 +113,7 @@ def _fault_of_hooks(
 
 
 def not_finite(env: Constructed, reward: float, observation: Any) -> str:
-    """Say what is not finite, before the step is undone."""
+    """Name the number that is not finite, before the step is undone."""
     fine = isfinite(reward)
     what = f"the observation is {shown(observation)}" if fine else env._explain(reward)
     return f"{what} at t = {env.time:g} s"

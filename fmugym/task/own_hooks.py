@@ -12,7 +12,7 @@ __all__ = ["OwnHooks", "is_overridden"]
 
 @dataclass(frozen=True, slots=True)
 class OwnHooks:
-    """Which methods an environment does not have from ``FMUEnv``, but from its class or itself.
+    """Methods that an environment has from its class or itself, and not from ``FMUEnv``.
 
     A hook may also be an attribute of the environment, such as a function.
     """
@@ -30,7 +30,7 @@ class OwnHooks:
 
     @classmethod
     def of(cls, env: Any, expressed: Container[str]) -> OwnHooks:
-        """Compare the methods of an environment with those of ``FMUEnv``.
+        """Compare the methods of an environment with the methods of ``FMUEnv``.
 
         Args:
             env: The environment.

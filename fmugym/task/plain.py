@@ -1,4 +1,4 @@
-"""Attributes that a class keeps on its own, beside those of ``FMUEnv``."""
+"""Attributes of a class's own, which ``FMUEnv`` does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quantities: the values of an episode that have a name, for people who look at it afterwards."""
+"""Quantities of recordings: named values of an episode, with units and limits."""
 
 from __future__ import annotations
 

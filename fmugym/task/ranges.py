@@ -1,4 +1,4 @@
-"""The ranges of start values: those that the config gives, or else those of the FMU."""
+"""Ranges of start values, from the config or else from the FMU."""
 
 from __future__ import annotations
 

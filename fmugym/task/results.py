@@ -157,7 +157,7 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
 
 
 def _of_short_arrays(space: spaces.Dict, checked: Finiteness) -> Finiteness:
-    """Check all arrays of a dict at once; what is not as usual is left to the other function."""
+    """Check all arrays of a dict at once; an unusual observation is left to the other function."""
     parts = tuple((name, part.dtype, part.shape) for name, part in space.spaces.items())
 
     def is_finite(observation: Any) -> bool:

@@ -1,4 +1,4 @@
-"""Which variables may be inputs and outputs of an environment."""
+"""Roles of variables: inputs and outputs of an environment."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def check_output(description: ModelDescription, variable: Variable) -> None:
 
 
 def check_readable(description: ModelDescription, variable: Variable) -> None:
-    """Do what ``check_output`` does for a variable that is read, but not observed.
+    """Check a variable that is read, but not observed; see ``check_output``.
 
     Raises:
         ConfigError: If it cannot be read.

@@ -56,7 +56,7 @@ def require_saving(pool: Pool) -> None:
 
 
 def columns_of(env: Constructed) -> Columns:
-    """Copy what makes the episode, except for the FMU's state.
+    """Copy the quantities and the random stream of the episode, without the FMU's state.
 
     Returns:
         Columns of one environment.
@@ -94,7 +94,7 @@ def note_attributes(env: Constructed) -> None:
 
 
 def read_columns(env: Constructed, column: Callable[[Any], SnapshotColumn]) -> Columns:
-    """Copy what hooks read, of one environment or of several.
+    """Copy the quantities of one episode or of several.
 
     Args:
         env: The environment, or the prototype of several.
@@ -199,7 +199,7 @@ def state_of(row: list[int]) -> dict[str, Any]:
 
 
 def scope_of(env: Constructed) -> Scope:
-    """What a snapshot's environment must have in common with this one."""
+    """Scope of the snapshots of an environment."""
     if env._scope is None:
         env._scope = _find_scope(env)
     return env._scope

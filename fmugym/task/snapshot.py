@@ -70,7 +70,7 @@ class Snapshot:
 
     @property
     def method(self) -> SaveMethod:
-        """How the FMU's states were saved."""
+        """Method by which the FMU's states were saved."""
         return self._bundle.method
 
     @property
@@ -206,7 +206,7 @@ def _first(column: Any) -> Any:
 
 
 def _content(column: Any) -> Any:
-    """What two equal columns have in common, whatever the type of their numbers is."""
+    """Content of a column, equal for equal columns, whatever the type of their numbers is."""
     if isinstance(column, dict):
         return {name: _content(part) for name, part in column.items()}
     if isinstance(column, np.ndarray) and column.dtype == object:

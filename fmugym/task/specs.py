@@ -32,7 +32,7 @@ class EpisodeLimit:
 
     @classmethod
     def of(cls, env: Any) -> EpisodeLimit:
-        """That of an environment; nothing may be longer than the episodes of a declared task."""
+        """Limit of an environment; nothing may be longer than the episodes of a declared task."""
         length = env.config.max_episode_steps
         if env.resolved is None or length is None:
             return cls(env.step_limit)

@@ -70,7 +70,7 @@ def check_rest_is_known(variables: Sequence[Variable]) -> None:
 
 
 def structural_values(description: ModelDescription, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the given values that are of structural parameters, by which arrays get their sizes.
+    """Values of structural parameters, by which arrays get their sizes.
 
     Raises:
         ConfigError: If one is a distribution: the sizes of spaces do not change.
@@ -141,7 +141,7 @@ def _check_start(description: ModelDescription, variable: Variable, value: Any) 
 
 
 def texts_in(variable: Variable, value: Any) -> Sequence[str]:
-    """The texts that a String may get: the given one, or those of a distribution.
+    """Texts that a String may get: the given one, or all of a distribution.
 
     Raises:
         ConfigError: If the distribution does not tell them.

@@ -1,4 +1,4 @@
-"""The order of a step: what is asked of the hooks when the FMU has stepped.
+"""Order of the hooks that are called when the FMU has stepped.
 
 Single environments and batches of environments differ in what hooks read and return: numbers or
 arrays. They share this order.
@@ -29,7 +29,7 @@ ORDER: Final = (
 
 
 class Form(Protocol):
-    """Turns what hooks return into numbers or arrays.
+    """Conversion of results of hooks to numbers or arrays.
 
     Each method raises ``ConfigError`` with the name of the hook if a result cannot be used.
 

@@ -34,7 +34,7 @@ _FAILED: Final = "the warm-up failed: "
 
 
 class WarmUp(ABC):
-    """What happens in a warm-up.
+    """Warm-up of episodes by moving inputs.
 
     Its methods read the environment as hooks do. The episodes are arrays with M environments on the
     last axis, also in a single environment. ``step_count`` rises to 0.
@@ -210,7 +210,7 @@ class WarmUps:
     # Warm-ups
 
     def _run(self, pool: Pool, episodes: Episode, indices: IndexArray) -> Mapping[str, Any]:
-        """Do the warm-up of episodes that have just begun; return what variables it has written."""
+        """Warm up episodes that have just begun; return the variables that this has written."""
         skip = np.ones(pool.num_instances, np.bool_)
         skip[indices] = False
         variables = self._play(pool, episodes, indices, skip)

@@ -55,7 +55,7 @@ def checked_actions(space: Any, num_envs: int, actions: Any) -> npt.NDArray[Any]
 
 
 def array_of(value: Any) -> npt.NDArray[Any]:
-    """A new array of what a caller gave; an empty one of objects if it makes none."""
+    """New array of a caller's value; an empty one of objects if it makes none."""
     try:
         return np.array(value)
     except Exception:  # lists that make no array, and the user's own __array__

@@ -1,4 +1,4 @@
-"""Checks of what a caller gives a vector environment: its size, its pool, seeds, masks, options."""
+"""Checks of arguments of a vector environment: its size, its pool, seeds, masks, options."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def checked_seeds(seed: Any, num_envs: int) -> list[int | None]:
 
 
 def _elements(values: Any) -> list[Any] | None:
-    """The elements of a sequence; None for what has no elements or no order, and for text."""
+    """Elements of a sequence; None for a value without elements or order, and for text."""
     if isinstance(values, str | bytes | bytearray | Mapping | set | frozenset):
         return None
     if not isinstance(values, Iterable) or not hasattr(values, "__len__"):

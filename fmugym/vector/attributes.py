@@ -34,7 +34,7 @@ _NAME: Final = "the name of an attribute"
 
 
 def require_settable(name: str) -> None:
-    """Refuse to set what the environments themselves keep.
+    """Refuse to set an attribute that the environments themselves keep.
 
     Raises:
         ConfigError: If the name is one of ``FMUEnv``'s own.
@@ -45,7 +45,7 @@ def require_settable(name: str) -> None:
 
 
 class Attributes:
-    """What ``get_attr``, ``set_attr`` and ``call`` of a vector environment read, set and call.
+    """Attributes and methods of the environments, for ``get_attr``, ``set_attr`` and ``call``.
 
     Args:
         prototype: The environment whose class and FMU all have.

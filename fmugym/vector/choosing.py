@@ -71,7 +71,7 @@ def make_engine(
 
 
 def require_own_order(env: FMUEnv) -> None:
-    """Refuse a class that does what only a single environment can do.
+    """Refuse a class that overrides ``step`` or ``reset``.
 
     Raises:
         ConfigError: If it overrides ``step`` or ``reset``.
@@ -130,7 +130,7 @@ def hook_of_one(cls: type[FMUEnv]) -> str | None:
 
 
 def no_arrays(env: FMUEnv) -> str | None:
-    """What of N environments makes no arrays, in words; None if everything does."""
+    """Obstacle to arrays of N environments, in words; None if there is none."""
     if not is_array_space(env.action_space):
         return f"actions of {env.action_space} do not make one array"
     if not _makes_arrays(env.observation_space):

@@ -55,7 +55,7 @@ def coded(rows: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
 
 
 def gathered(infos: Mapping[int, Mapping[str, Any]], count: int) -> dict[str, Any]:
-    """Make infos of those of single environments.
+    """Make infos of N environments from infos of single ones.
 
     The first value of a name decides on the type: numbers make an array of numbers, arrays an array
     with one more axis, dicts a dict, and anything else an array of objects.

@@ -55,7 +55,7 @@ class Episodes:
         return Snapshot(scope_of(self._prototype), self._engine.columns(indices), bundle)
 
     def columns_of(self, snapshot: Snapshot) -> Columns:
-        """What hooks read in the episodes of a snapshot.
+        """Columns of a snapshot.
 
         Raises:
             ConfigError: If the snapshot is of another FMU or config.
@@ -76,7 +76,7 @@ class Episodes:
         self._engine.place(self.columns_of(snapshot), sources, self._everywhere)
 
     def restore(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
-        """Restore the FMUs of some environments; what hooks read stays.
+        """Restore the FMUs of some environments; their quantities stay.
 
         Args:
             bundle: The saved FMUs.
@@ -115,7 +115,7 @@ class Episodes:
     def start_of_rollout(
         self, snapshot: Snapshot | None, present: Snapshot | None, count: int
     ) -> Snapshot:
-        """Where candidates begin: the snapshot that was given, or else the present episodes.
+        """Start of candidates: the snapshot that was given, or else the present episodes.
 
         Raises:
             ConfigError: If the snapshot does not fit, or not so many candidates.

@@ -45,7 +45,7 @@ def drawn_info(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[
 
 
 def late_info(draws: EpisodeStart) -> tuple[Any, ...]:
-    """How the C extension makes ``"drawn"`` of ``drawn_info`` from drawn values and a mask."""
+    """Function for the C extension, which makes ``"drawn"`` from drawn values and a mask."""
     return LateDict, UNFILLED, partial(_told, draws)
 
 
@@ -110,7 +110,7 @@ def copy_rows(source: Any, target: Any, mask: MaskArray) -> None:
 
 
 def rows_not_finite(values: Any) -> MaskArray | None:
-    """Which rows of an array, or of a dict of arrays, hold NaN or infinity; None for no row."""
+    """Mask of rows with NaN or infinity in an array or a dict of arrays; None for no row."""
     if type(values) is dict:
         found = [rows for rows in map(rows_not_finite, values.values()) if rows is not None]
         return np.logical_or.reduce(found) if found else None

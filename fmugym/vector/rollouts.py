@@ -1,4 +1,4 @@
-"""Rollouts: what many candidates for the next actions would lead to."""
+"""Rollouts of many candidates for the next actions."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _Steps(NamedTuple):
 
 
 class Rollout(_Steps):
-    """What n candidates have led to in up to ``horizon`` steps.
+    """Results of n candidates in up to ``horizon`` steps.
 
     It is a tuple of the first five attributes.
 
@@ -131,7 +131,7 @@ def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
 
 
 class Candidates:
-    """What n candidates do: given actions, or a policy.
+    """Candidates: given actions, or a policy.
 
     Args:
         count: n.
@@ -163,7 +163,7 @@ class Candidates:
 
     @classmethod
     def of(cls, space: Any, num_envs: int, actions: Any, horizon: Any) -> Candidates:
-        """Check what a caller gave.
+        """Check the actions of a caller.
 
         Raises:
             ConfigError: If there are no candidates, the shape does not fit, or an action is not
@@ -178,7 +178,7 @@ class Candidates:
         return cls(len(array), array.shape[1], num_envs, array)
 
     def seen_in(self, columns: Columns) -> Columns:
-        """What hooks read where candidates begin: outputs with their offsets."""
+        """Columns of the start of candidates: outputs with their offsets."""
         if self.offsets is None:
             return columns
         shifted = {}
@@ -237,7 +237,7 @@ def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.ND
 
 
 def tables_of(env: FMUEnv, data: Any) -> dict[str, FloatArray]:
-    """Check what candidates assume in the place of data.
+    """Check data that candidates assume.
 
     Args:
         env: Its task has the data.
@@ -254,7 +254,7 @@ def tables_of(env: FMUEnv, data: Any) -> dict[str, FloatArray]:
 
 
 def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
-    """Check what is added to outputs.
+    """Check offsets of outputs.
 
     Args:
         env: The FMU's outputs are its own.
@@ -276,7 +276,7 @@ def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
 
 
 def keys_of(env: FMUEnv, seed: Any) -> dict[str, float]:
-    """Draw what the random numbers of later steps follow from.
+    """Draw the keys of the noise of later steps.
 
     Args:
         env: The prototype.
@@ -348,7 +348,7 @@ def _in_words_of_candidates(error: ConfigError, space: Any, array: npt.NDArray[A
 
 
 class _Arrays:
-    """What the steps of a rollout lead to, in arrays with the steps on the first axis.
+    """Results of a rollout, in arrays with the steps on the first axis.
 
     Args:
         horizon: The number of steps.

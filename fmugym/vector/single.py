@@ -79,7 +79,7 @@ class ExpressionStep:
         self._take_over(env, EpisodeColumn(rows, 0))
 
     def _take_over(self, env: FMUEnv, readings: EpisodeColumn) -> None:
-        """Let the environment read from the arrays what it reads now."""
+        """Let the environment read its quantities from the arrays."""
         own = env._episode
         for name in READ:
             setattr(readings, name, getattr(own, name))

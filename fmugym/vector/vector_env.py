@@ -435,7 +435,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         offsets: Mapping[str, float] | None = None,
         seed: int | None = None,
     ) -> Rollout:
-        """Find out what candidates for the next actions would lead to.
+        """Try out candidates for the next actions.
 
         The environments return to their present episodes afterwards, if they have any. Hooks are
         included.

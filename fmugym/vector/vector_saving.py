@@ -59,7 +59,7 @@ def chosen(where: Any, num_envs: int) -> IndexArray:
 
 
 def sources_for(snapshot: Snapshot, indices: IndexArray) -> IndexArray:
-    """Which episode of a snapshot each of some environments gets.
+    """Episode of a snapshot for each of some environments.
 
     Raises:
         ConfigError: If it has neither one nor as many episodes.
@@ -85,7 +85,7 @@ def which_of(indices: IndexArray, count: int) -> Which:
 
 
 def batch_columns(env: FMUEnv, which: Which) -> Columns:
-    """Copy what hooks read in some environments of a batch, whose prototype this is."""
+    """Copy the quantities of some episodes of a batch, whose prototype this is."""
     require_quantities(env)
     columns = read_columns(env, partial(_rows, which))
     return columns | {"pictured": None}
@@ -112,7 +112,7 @@ def place_column(row: npt.NDArray[Any], column: Any, sources: Which, which: Whic
 
 
 def require_fit(columns: Columns) -> None:
-    """Refuse what single environments may have, but not those of a batch.
+    """Refuse columns that only single environments may have.
 
     Raises:
         ConfigError: If the random generator is not a ``numpy.random.PCG64``.

@@ -58,7 +58,7 @@ def batched(env: FMUEnv, count: int, pool: Pool | None = None) -> Episode:
 
 
 def some(batch: Episode, which: npt.NDArray[np.intp] | slice = slice(None)) -> Episode:
-    """Return copies of what the hooks of some environments of a batch read, in the same form.
+    """Copy the quantities of some episodes of a batch, in the same form.
 
     Args:
         batch: What the hooks of all read.
@@ -75,7 +75,7 @@ def start_numbers(batch: Episode, which: Any) -> None:
 
 
 def keep_rows(batch: Episode, which: Any) -> None:
-    """Let quantities before the step be those of now, in some episodes."""
+    """Keep the quantities of some episodes as those before the step."""
     for name, now in PREVIOUS.items():
         getattr(batch, name)[..., which] = getattr(batch, now)[..., which]
 
@@ -190,7 +190,7 @@ EpisodeColumn.state = _column_property("state", _numbers)
 
 
 class _ColumnVariables(EpisodeVariables):
-    """The episode variables of one of N environments; what is written goes to their arrays."""
+    """Episode variables of one of N environments; assignments go to their arrays."""
 
     def __init__(self, rows: Mapping[str, npt.NDArray[Any]], index: int) -> None:
         dict.__init__(self, {name: take(row, index) for name, row in rows.items()})

@@ -183,7 +183,7 @@ class ArrayEngine(BatchEngine):
             self._restore_variables(self._idle)
 
     def _keep_variables(self) -> None:
-        """Copy what hooks have assigned to the arrays that the pool keeps, or make others."""
+        """Copy assigned variables to the arrays that the pool keeps, or make others."""
         variables, held = self.env.variables, self._memory.variables
         if not held:
             return

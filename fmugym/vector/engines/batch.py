@@ -349,7 +349,7 @@ class BatchEngine(Engine):
         self._note_foreign(indices, draws is not self.env.episode_start)
 
     def _numbers_of_told_texts(self, draws: EpisodeStart, drawn: FloatArray) -> dict[str, Any]:
-        """What options give to Strings: places among the texts that only these draws know."""
+        """Strings from options: places among the texts that only these draws know."""
         told = draws.strings.keys() & draws.told.keys()
         numbers = draws.constant_parameters | draws.named(drawn) if told else {}
         return {name: numbers[name] for name in told}

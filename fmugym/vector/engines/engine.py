@@ -21,7 +21,7 @@ __all__ = ["Engine", "StepResult", "attribute", "failed_in"]
 
 
 def failed_in(statuses: StatusArray) -> MaskArray:
-    """Where FMUs have failed; that one has asked to stop is no failure."""
+    """Mask of FMUs that have failed; a request to stop is no failure."""
     failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
     return failed
 
@@ -161,7 +161,7 @@ class Engine(ABC):
 
     @abstractmethod
     def _start(self, mask: MaskArray) -> Any:
-        """Start episodes in the middle of a step; returns what ``_conclude`` tells of them."""
+        """Start episodes in the middle of a step; return their infos for ``_conclude``."""
 
     @abstractmethod
     def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
@@ -231,7 +231,7 @@ class Engine(ABC):
 
     @property
     def has_expressions_only(self) -> bool:
-        """Whether programs of expressions do what hooks would."""
+        """Whether programs of expressions run in the place of hooks."""
         return self.way == "expressions"
 
     @abstractmethod
@@ -256,7 +256,7 @@ class Engine(ABC):
 
     @abstractmethod
     def columns(self, indices: IndexArray) -> Columns:
-        """Copy what makes the episodes of some environments, except for the FMUs' states."""
+        """Copy the quantities and random streams of some episodes, without the FMUs' states."""
 
     def require_fit(self, columns: Columns) -> None:
         """Refuse columns that these environments cannot have.
@@ -292,4 +292,4 @@ class Engine(ABC):
 
     @abstractmethod
     def observe(self, indices: IndexArray) -> Any:
-        """The observations of all environments; those of the given ones may have changed."""
+        """Observations of all environments; the given ones may have changed."""

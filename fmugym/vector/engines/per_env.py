@@ -146,7 +146,7 @@ class PerEnvEngine(Engine):
             raise
 
     def _add_offsets(self, idle: MaskArray | None = None) -> None:
-        """See ``Engine._add_offsets``; the pool has made observations of what was before them."""
+        """See ``Engine._add_offsets``; the pool has made observations without them."""
         super()._add_offsets(idle)
         if self.offsets is not None:
             observed = self._pool.observations

@@ -1,4 +1,4 @@
-"""The check of hooks: do they give on arrays what they give one environment at a time?
+"""Check of hooks: equality of their results on arrays and one by one.
 
 ``if abs(x) > 2.4`` raises on arrays, but ``np.any`` and ``norm`` without an axis silently give one
 answer for all environments, and a transposed observation has the right shape if there are as many
@@ -69,7 +69,7 @@ _Kind = Literal["step", "start", "failed", "limit"]
 
 @dataclass(frozen=True)
 class _Row:
-    """What hooks read in one environment, which is of a kind.
+    """Row of a check: the quantities of one environment, of a kind.
 
     Attributes:
         kind: ``"step"``; ``"start"`` if an episode has just begun; ``"failed"`` if the FMU has not
@@ -284,7 +284,7 @@ def _batches(rows: Sequence[_Row], count: int) -> Iterator[list[_Row]]:
 
 
 def _batch_of(env: FMUEnv, rows: Sequence[_Row], name: str) -> Episode:
-    """What a hook reads in environments, in arrays."""
+    """Quantities of some environments in arrays, as a hook reads them."""
     batch = batched(env, len(rows))
     states = [_moment(env, row, name) for row in rows]
     for index, one in enumerate(states):
@@ -305,7 +305,7 @@ def _array_of(values: list[Any]) -> Any:
 
 
 def _moment(env: FMUEnv, row: _Row, name: str) -> Episode:
-    """What a hook reads in one environment: not all is known yet when the first are called."""
+    """Quantities of one environment, as a hook reads them: the first hooks know fewer."""
     now = row.episode
     if name not in _WRITING:
         return now.replaced(done=row.done and name != "_is_done")
@@ -320,11 +320,11 @@ def _moment(env: FMUEnv, row: _Row, name: str) -> Episode:
 
 
 class _DifferenceError(Exception):
-    """What is wrong with a hook."""
+    """Error of a hook, in words."""
 
 
 class _FailureError(Exception):
-    """What a hook has raised."""
+    """Exception of a hook, in words."""
 
 
 @dataclass
@@ -394,7 +394,7 @@ class _Comparison:
         return row.kind != "failed"
 
     def _called(self, episode: Episode, of: Callable[[Any], Any]) -> Any:
-        """Call the hook; return its result, if it has changed only what it may.
+        """Call the hook; return its result, unless it has changed other values than it may.
 
         Raises:
             _DifferenceError: If it has changed something else.
@@ -466,7 +466,7 @@ _WHICH: Final[Mapping[str, str]] = {
 
 
 def _require_unchanged(before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-    """Raise a ``_DifferenceError`` if a hook has changed what it reads."""
+    """Raise a ``_DifferenceError`` if a hook has changed a quantity that it reads."""
     for name, value in before.items():
         if name == "variables" and not _same(value, after[name]):
             raise _DifferenceError(
@@ -488,7 +488,7 @@ def _require_attributes(env: FMUEnv, before: Mapping[str, Any], plain: Mapping[s
 
 
 def _values_in(episode: Episode, hook: str) -> dict[str, Any]:
-    """Copies of what a hook must not change."""
+    """Copies of quantities that a hook must not change."""
     kept: dict[str, Any] = {name: np.copy(getattr(episode, name)) for name in _READ_ONLY}
     if hook not in _WRITING:
         kept["variables"] = {name: np.copy(one) for name, one in episode.variables.items()}

@@ -147,7 +147,7 @@ class Translation:
         return Value(self._graph, self._graph.load(attribute, index, dtype))
 
     def _read(self, what: Any) -> Value:
-        """What an environment has, see ``Value.read``."""
+        """Quantity of an environment, see ``Value.read``."""
         if what in self._known:
             return self._known[what]
         name, *keys = what
@@ -177,7 +177,7 @@ class Translation:
 def written_variables(
     env: FMUEnv, graph: Graph, updates: Sequence[Update]
 ) -> dict[tuple[Any, ...], Value]:
-    """What updates write to episode variables; environments that have not stepped keep theirs.
+    """Values that updates write to episode variables; the others keep theirs without a step.
 
     Args:
         env: An environment of the task.

@@ -149,7 +149,7 @@ def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:
 
 
 def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
-    """Copy what a hook has assigned to an episode variable; the last axis becomes (N,)."""
+    """Copy the value of an episode variable from a hook; its last axis becomes (N,)."""
     try:
         array = np.array(value)
         fits = array.dtype.kind in _NUMBERS and array.shape[-1:] in {(), (count,)}
@@ -185,7 +185,7 @@ def type_of_variable(draws: EpisodeStart, name: str, assigned: np.dtype[Any]) ->
 def restore_variable(
     name: str, row: npt.NDArray[Any], mask: MaskArray, before: npt.NDArray[Any]
 ) -> None:
-    """Undo what ``_update`` has assigned to an episode variable of the environments in a mask."""
+    """Undo the assignment of ``_update`` to an episode variable of environments in a mask."""
     try:
         np.copyto(row, before, where=mask, casting="unsafe")  # half the time of an assignment
     except ValueError:
@@ -218,7 +218,7 @@ def _info_row(name: str, value: Any, count: int) -> Any:
 
 
 def _everywhere(value: Any, array: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
-    """The same value for all environments; text and objects stay what they are."""
+    """The same value for all environments; text and objects stay the same."""
     if array.dtype.kind in "biufc":
         return np.full(count, array[()])
     objects = np.empty(count, object)

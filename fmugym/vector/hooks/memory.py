@@ -1,4 +1,4 @@
-"""The arrays of compiled steps, and what the pool is told of them."""
+"""Arrays of compiled steps, and their description for the pool."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ class StepArrays:
         self.show()
 
     def take_back(self, before: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Keep what the variables were before the step, in other types and shapes than now."""
+        """Keep values of variables before the step, in other types and shapes than now."""
         every = np.ones(self._n, np.bool_)
         for name, values in before.items():
             hook_results.restore_variable(name, self.before[name], every, values)
 
     def show(self) -> None:
-        """Let hooks on arrays read what the pool keeps."""
+        """Show hooks the arrays that the pool keeps."""
         read, width = self._episodes, self._env.interface.output_count
         read.action, read.previous_action = (np.moveaxis(a, 0, -1) for a in self.actions)
         self.kept[:width] = read.previous_state
@@ -149,7 +149,7 @@ class StepArrays:
         return np.broadcast_to(start, self.variables[name].shape[:-1]).reshape(-1)
 
     def _action_group(self) -> dict[str, Any]:
-        """How the pool checks and keeps actions."""
+        """Description of actions for the pool."""
         env, dtype = self._env, self.actions[0].dtype
         space: Any = env.action_space
         is_discrete = isinstance(space, spaces.Discrete)
@@ -171,7 +171,7 @@ class StepArrays:
     def _surroundings(
         self, task: TaskPrograms, drawn: Sequence[Draw], results: tuple[Any, ...]
     ) -> dict[str, Any]:
-        """What the pool keeps beside the programs; see ``NativePool.prepare_play``.
+        """Description of everything beside the programs; see ``NativePool.prepare_play``.
 
         Args:
             task: The programs.
