@@ -13,7 +13,6 @@ from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.licences import licence_errors, wait_for_licence
-from fmugym.pool.local import local_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
 from fmugym.pool.saving_pool import SavingPool, offered_method
@@ -76,7 +75,7 @@ def make_pool(
 def _made(plan: Plan, starts: Starts | None, length: int | None, *, spare: bool) -> Plan:
     """Complete a plan; that may take a trial of the FMU."""
     fmu, exempt = plan.fmu, is_exempt(plan.fmu)
-    tried = replace(plan.spec, num_observed=0, leak_limit=None, fault_retries=0, blind_start=False)
+    tried = replace(plan.spec, num_observed=0, leak_limit=None, fault_retries=0, licence_wait=0.0)
     plan = plan.completed(_verdict(plan, tried, starts, length))
     offered = offered_method(fmu.description, plan.spec)
     if fmu.bundled or offered is SaveMethod.REPLAY:
@@ -125,9 +124,12 @@ def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
     if threads is None and plan.fmu.calls_python():
         threads = 1  # several would spend most of the time with handing Python over
     if not plan.is_isolated:
-        private = how.private_libraries
-        return local_pool(*what, threads=threads, private_libraries=private)
-    pool = ProcessPool(
+        from fmugym.pool.native import NativePool
+
+        alone = is_alone(plan.fmu) and plan.num_instances > 1
+        private = alone if how.private_libraries is None else how.private_libraries
+        return NativePool(*what, threads=threads, private_libraries=private)
+    return ProcessPool(
         *what,
         workers=how.workers,
         threads=threads,
@@ -135,5 +137,3 @@ def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
         private_libraries=bool(how.private_libraries),
         call_timeout=how.call_timeout,
     )
-    pool.retry_resets(plan.fmu.path.name, log)
-    return pool

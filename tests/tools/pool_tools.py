@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -51,7 +51,7 @@ def open_pool(
     read = sampled(read, samplings)
     spec = PoolSpec(given, read, time_step, **spec)
     if options is None:
-        pool = local_pool(fmu, spec, n, LOG, private_libraries=private)
+        pool = NativePool(fmu, spec, n, LOG, private_libraries=private)
     else:
         pool = opening.make_pool(fmu, spec, n, LOG, **options)
     pool.variable = fmu.variable
