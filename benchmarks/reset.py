@@ -17,7 +17,8 @@ from tables import Table, duration, rate, times
 
 import fmugym
 from fmugym.pool import PoolSpec
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 __all__ = ["tables"]
 
@@ -64,7 +65,7 @@ def _pool(stack: ExitStack) -> Run:
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     outputs = tuple(map(fmu.variable, ("x", "x_dot", "phi", "phi_dot")))
     spec = PoolSpec((fmu.variable("f"),), outputs, 0.02, num_observed=4)
-    pool = make_pool(fmu, spec, SIZE, logging.getLogger(__name__), backend="native", threads=1)
+    pool = open_pool(fmu, spec, SIZE, logging.getLogger(__name__), PoolOptions("native", threads=1))
     stack.callback(pool.close)
     variables, mask = tuple(map(fmu.variable, START_VALUES)), np.ones(SIZE, np.bool_)
     values = itertools.cycle(np.random.default_rng(0).uniform(-0.05, 0.05, (16, 4, SIZE)))

@@ -176,8 +176,7 @@ class Arena:
     def _options(self) -> dict[str, Any]:
         """Worker processes for an FMU that calls Python, which one process steps one by one."""
         with closing(self.make_env()) as env:
-            opening = env.inside.opening
-            is_free = opening.backend is None and opening.isolation is None
+            is_free = env.inside.backend is None and env.inside.isolation is None
             apart = is_free and env.config.isolation is None and env.fmu.calls_python()
         return {"isolation": "process"} if apart and available_processors() > 1 else {}
 

@@ -25,6 +25,7 @@ from fmugym.linearization.sensitivities import (
     require_vector,
 )
 from fmugym.pool.base import FloatArray
+from fmugym.task.pool_opening import open_env_pool
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.starting import start_variable
 from fmugym.vector.vector_env import FMUVectorEnv
@@ -229,7 +230,7 @@ def _by_directional_derivatives(
     """Play the trajectory with an instance of its own, and ask that for derivatives."""
     env = envs.inside.maker.make()
     try:
-        env.inside.use(env.inside.opening.open(1))
+        env.inside.use(open_env_pool(env))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)

@@ -17,7 +17,8 @@ from weakref import WeakSet
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.checks import check_mapping
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_mapping, check_option
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, support_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name, warn_once
@@ -25,7 +26,7 @@ from fmugym.expressions.by_numpy import hooks_of
 from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.quantities import KEPT
 from fmugym.expressions.value import Value
-from fmugym.pool import Pool, PoolSpec
+from fmugym.pool import ISOLATIONS, Pool, PoolSpec
 from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
@@ -37,7 +38,12 @@ from fmugym.task.inside import Inside, OwnHooks, is_overridden
 from fmugym.task.interface import resolve
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
-from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
+from fmugym.task.pool_opening import (
+    env_numbers,
+    open_env_pool,
+    open_fmu,
+    pools_are_deferred,
+)
 from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
 from fmugym.task.step import ORDER
@@ -105,17 +111,11 @@ class Constructed(Pictured):
 
     def _open(self, backend: Any, isolation: str | None) -> None:
         """Open the pool, unless a vector environment is going to give one."""
-        self.inside.opening = PoolOpening(
-            self.fmu,
-            self.inside.spec,
-            self.config,
-            self.inside.draws,
-            self.logger,
-            backend,
-            isolation,
-        )
+        if isolation is not None:
+            check_option("isolation", isolation, ISOLATIONS)
+        self.inside.backend, self.inside.isolation = backend, isolation
         if not pools_are_deferred():
-            self.inside.use(self.inside.opening.open())
+            self.inside.use(open_env_pool(self))
 
     def _open_pool(self, method: str) -> Pool:
         """The pool, which is opened now if that has been deferred."""
@@ -123,9 +123,8 @@ class Constructed(Pictured):
             require_construction(self)
             if self.inside.is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-            self.inside.opening = self.inside.opening.apart()
-            self.fmu = self.inside.opening.fmu
-            self.inside.use(self.inside.opening.open())
+            self.fmu = FMU.of(self.fmu)  # which others may share
+            self.inside.use(open_env_pool(self))
         return self.inside.pool
 
     @property
@@ -232,7 +231,7 @@ def require_construction(env: Constructed) -> None:
     Raises:
         ConfigError: If it has not.
     """
-    if not hasattr(env.inside, "opening"):
+    if not hasattr(env.inside, "backend"):
         name = type(env).__name__
         raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 

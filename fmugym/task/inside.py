@@ -19,7 +19,6 @@ from fmugym.task.episode import EpisodeDraws
 from fmugym.task.future import Future
 from fmugym.task.input_writer import InputWriter
 from fmugym.task.interface import Interface
-from fmugym.task.pool_opening import PoolOpening
 from fmugym.task.readings import NoReadings, Readings
 from fmugym.task.warm_up import WarmUps
 
@@ -87,7 +86,7 @@ class Inside:
         as_constructed: The plain attributes of a subclass when its hooks were prepared.
         interface: The variables of the config, as the FMU has them.
         spec: What the pool does at each reset and step.
-        opening: Opens pools.
+        backend, isolation: Those of the constructor, for the pool.
         pool: The open pool: of one, or of N if a vector environment steps it.
         step_pool, halt, input_row, output_row: Parts of the pool that each step needs.
         observation_row: The pool's observation of this environment.
@@ -156,7 +155,8 @@ class Inside:
     number: int
     observation_row: npt.NDArray[np.float32]
     observe: Callable[[Any], Any]
-    opening: PoolOpening
+    backend: Any
+    isolation: str | None
     output_count: int
     output_row: FloatArray
     own: OwnHooks

@@ -222,7 +222,7 @@ class Searching:
     def _is_fmu(self) -> bool:
         """Whether an FMU steps, and nothing in its place."""
         with closing(self.make_env()) as env:
-            return env.inside.opening.backend is None
+            return env.inside.backend is None
 
     def _winner(self) -> Agent:
         """Search, and find the winner of the last validation.

@@ -17,6 +17,7 @@ from fmugym.checks import check_count, check_misplaced
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.task.construction import prepare_hooks, require_construction
+from fmugym.task.pool_opening import open_env_pool
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.specs import EpisodeLimit
@@ -72,7 +73,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ``infos["final_obs"]``, in the form of observations, and ``infos["final_info"]``, where
             ``infos["_final_obs"]`` is true) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
-        pool_options: Wishes of ``fmugym.pool.wishes.Wishes``: ``backend``, ``threads``,
+        pool_options: Of ``fmugym.trial.pool_options.PoolOptions``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
     Attributes:
@@ -128,8 +129,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         env = self.inside.prototype
         try:
             require_own_order(env)
-            self.inside.pool = env.inside.opening.open(
-                self.num_envs, max_episode_steps=max_episode_steps, **pool_options
+            self.inside.pool = open_env_pool(
+                env, self.num_envs, max_episode_steps=max_episode_steps, **pool_options
             )
             try:
                 env.inside.use(self.inside.pool)

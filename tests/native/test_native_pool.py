@@ -19,7 +19,8 @@ from fmugym.archive.bundled import BUNDLED
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 from fmugym.trial.trial import compare
 from fmugym.trial.verdict import Neighbours
 
@@ -358,8 +359,8 @@ class TestIsolation:
     def test_by_the_flag(self, opened, tmp_path):
         flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
         path = busy_fmu(tmp_path, "-DSHARED", flags=flag)
-        open_pool = functools.partial(make_pool, isolation="none")
-        assert self.run(opened(make(open_pool, path, ["work"], ["total"], 3))) == [3, 3, 3]
+        cls = functools.partial(open_pool, options=PoolOptions(isolation="none"))
+        assert self.run(opened(make(cls, path, ["work"], ["total"], 3))) == [3, 3, 3]
 
     def test_where_no_copy_can_be_made(self, native, shared, monkeypatch):
         def full(*_, **options):

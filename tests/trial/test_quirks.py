@@ -27,7 +27,7 @@ from fmugym.errors import ContractError
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
-from fmugym.trial import plan as trial_plan
+from fmugym.trial import execution
 from fmugym.trial.known import known_verdict
 from fmugym.trial.trial import examine
 from fmugym.trial.trial_episodes import Inputs
@@ -154,7 +154,7 @@ class TestEpisodes:
 @pytest.fixture
 def nothing_warned(monkeypatch):
     """A process that has not warned of any FMU yet."""
-    monkeypatch.setattr(trial_plan, "_warned", set())
+    monkeypatch.setattr(execution, "_told", set())
 
 
 @cases
