@@ -22,7 +22,7 @@ from tables import Table, rate, times
 
 from fmugym import FMU
 from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 
 __all__ = ["tables"]
 
@@ -112,7 +112,7 @@ def _pool_run(
         tolerance=TOLERANCE,
         **options,
     )
-    pool = local_pool(fmu, spec, count, logging.getLogger(__name__))
+    pool = NativePool(fmu, spec, count, logging.getLogger(__name__))
     stack.callback(pool.close)
     pool.reset((), np.empty((0, count)))
     inputs, step_own = pool.inputs, pool.step_own

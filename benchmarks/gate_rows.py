@@ -264,12 +264,13 @@ def _rollouts(size: int, stack: ExitStack) -> Workload:
 def _pool(size: int, stack: ExitStack) -> Workload:
     """A pool of cart-poles; its makers are no public face, so this function changes with them."""
     from fmugym.pool import PoolSpec
-    from fmugym.trial.opening import make_pool
+    from fmugym.trial.opening import open_pool
+    from fmugym.trial.pool_options import PoolOptions
 
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     outputs = tuple(map(fmu.variable, ("x", "x_dot", "phi", "phi_dot")))
     spec = PoolSpec((fmu.variable("f"),), outputs, 0.02, num_observed=4)
-    pool = make_pool(fmu, spec, size, logging.getLogger(__name__), threads=1)
+    pool = open_pool(fmu, spec, size, logging.getLogger(__name__), PoolOptions(threads=1))
     stack.callback(pool.close)
 
     def block() -> None:

@@ -20,7 +20,7 @@ from tables import Table, rate, times
 
 from fmugym import FMU, bundled_fmu
 from fmugym.pool import Pool, PoolSpec
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import MASTERS, ComponentPlan, Evaluation, Group, Link, SystemPlan
 
@@ -162,7 +162,7 @@ def _pool(
     stack: ExitStack, model: Model, fmu: FMU, inputs: list[str], outputs: list[str], count: int
 ) -> Pool:
     spec = PoolSpec(tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), model.step)
-    pool = local_pool(fmu, spec, count, logging.getLogger(__name__), threads=1)
+    pool = NativePool(fmu, spec, count, logging.getLogger(__name__), threads=1)
     stack.callback(pool.close)
     of_one = {f"{one}.{name}": value for one in NAMES for name, value in model.starts}
     starts = of_one if isinstance(fmu, SystemFMU) else dict(model.starts)

@@ -86,7 +86,7 @@ class FMUEnv(Constructed):
         backend: What stands in for the FMU, which then only describes the variables: an object
             with ``reset``, ``step`` and ``stop`` (``fmugym.pool.Backend``), or
             ``fmugym.pool.Paced`` around it. Or the name of a way to step the FMU, see
-            ``fmugym.pool.wishes.Wishes``.
+            ``fmugym.trial.pool_options.PoolOptions``.
         isolation: Where the FMU runs; by default where the config says.
 
     Attributes:

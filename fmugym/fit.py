@@ -103,7 +103,7 @@ def fit_logs(
             initial_states=states,
             fixed={n: v for n, v in plant.given.items() if n not in wanted | states},
             wash_in=wash_in,
-            plant=plant.env.pool_opening,
+            plant=plant.env,
             advance=advance,
         )
         return fit_of(experiment, wanted, trajectories, candidates)

@@ -12,13 +12,14 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import start_of
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
-from fmugym.task.pool_opening import PoolOpening
+from fmugym.task.pool_opening import pool_options
 from fmugym.task.starting import start_variable
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
 
 __all__ = ["FitSettings", "Simulator", "median_interval", "silent"]
 
@@ -38,9 +39,9 @@ def silent(count: float) -> None:
 class FitSettings:
     """The common settings of a fit and its predictions; see ``fit_parameters``.
 
-    ``plant`` is how an environment opens the FMU,
-    if one does; its communication steps, samplings and start time hold then. ``advance`` is told
-    how many simulations were done since its last call.
+    ``plant`` is the environment of the FMU, if there is one; its communication steps, samplings
+    and start time hold then. ``advance`` is told how many simulations were done since its last
+    call.
     """
 
     fmu: FMU
@@ -50,7 +51,7 @@ class FitSettings:
     time_step: float | None = None
     drop_repeats: bool = False
     wash_in: float | None = None
-    plant: PoolOpening | None = None
+    plant: FMUEnv | None = None
     advance: Callable[[float], None] = silent
 
 
@@ -106,9 +107,10 @@ class Simulator:
         spec = PoolSpec(inputs, outputs, step)
         count = num_sets * len(trajectories)
         if plant is None:
-            self._pool = make_pool(fmu, spec, count, logger)
+            self._pool = open_pool(fmu, spec, count, logger)
         else:
-            self._pool = replace(plant, fmu=fmu, spec=_as_in(plant.spec, spec)).open(count)
+            spec = _as_in(plant.pool_spec, spec)
+            self._pool = open_pool(fmu, spec, count, plant.logger, pool_options(plant))
 
     def close(self) -> None:
         """Free all instances."""

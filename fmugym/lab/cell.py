@@ -24,7 +24,7 @@ from fmugym.lab.lab_options import Options
 from fmugym.lab.sensors import Sensors
 from fmugym.pool import Pool, PoolSpec
 from fmugym.task.starting import start_variable
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
 
 __all__ = ["Cell", "checked_parameters"]
 
@@ -144,7 +144,7 @@ class Cell:
             )
             names = (*self.plant.start_positions, *self._parameters)
             self._start_variables = tuple(map(fmu.variable, names))
-            self._pool = make_pool(fmu, spec, 1, logger)
+            self._pool = open_pool(fmu, spec, 1, logger)
         return self._pool
 
     def _reset(self, position: Sequence[float], changes: Mapping[str, float]) -> None:

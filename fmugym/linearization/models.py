@@ -19,7 +19,6 @@ from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.licences import licence_errors
-from fmugym.pool.local import local_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.system_description import SystemDescription
@@ -109,7 +108,9 @@ def linearize(
 def _open(fmu: FMU, spec: PoolSpec) -> Pool:
     """An unknown FMU runs in a process of its own, which it may crash."""
     if fmu.bundled and not fmu.isolated:
-        return local_pool(fmu, spec, 1, logger, threads=1)
+        from fmugym.pool.native import NativePool
+
+        return NativePool(fmu, spec, 1, logger, threads=1)
     return ProcessPool(fmu, spec, 1, logger, threads=1)
 
 

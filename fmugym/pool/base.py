@@ -91,6 +91,7 @@ class Pool(ABC):
         observations: The array that ``step_own`` fills, shape (N, num_observed).
         step_own: Does one step with the values in ``inputs``, and fills ``observations``.
             Returns how many instances have a status worse than a warning.
+        execution: Sentences on how the pool runs, and why; see ``fmugym.trial.opening``.
     """
 
     num_instances: int
@@ -99,6 +100,7 @@ class Pool(ABC):
     statuses: StatusArray
     observations: npt.NDArray[np.float32]
     step_own: Callable[[], int]
+    execution: tuple[str, ...] = ()
 
     @abstractmethod
     def reset(

@@ -29,13 +29,15 @@ class Claim:
 
     def close(self) -> None:
         """Let others make instances; more than one call is fine."""
-        _claims.discard(self)
+        _claims.pop(id(self), None)
 
     def __str__(self) -> str:
         return f"{self.instances} for {self.purpose}"
 
 
-_claims: Final[weakref.WeakSet[Claim]] = weakref.WeakSet()
+_claims: Final[weakref.WeakValueDictionary[int, Claim]] = weakref.WeakValueDictionary()
+"""The claims by their ids; a list of ``valuerefs`` is made in one go, unlike one of a WeakSet."""
+
 _lock: Final = threading.Lock()
 
 if hasattr(os, "register_at_fork"):
@@ -68,12 +70,13 @@ def claim_instances(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Claim
             name, most = fmu.path.name, spec.max_instances
             raise LicenceError(_refusal(name, most, count, purpose, taken))
         claim = Claim(content, count, purpose)
-        _claims.add(claim)
+        _claims[id(claim)] = claim
     return claim
 
 
 def _taken(content: str) -> list[Claim]:
-    return [claim for claim in list(_claims) if claim.content == content]
+    claims = [reference() for reference in _claims.valuerefs()]
+    return [claim for claim in claims if claim is not None and claim.content == content]
 
 
 def _refusal(name: str, most: int, count: int, purpose: str, taken: list[Claim]) -> str:

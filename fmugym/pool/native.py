@@ -72,8 +72,7 @@ class NativePool(AskingPool):
         threads: The most threads to use, including the calling one; by default one for each
             processor that this process may use. The results do not depend on it.
         private_libraries: Whether each instance gets a private copy of the FMU's library, and so
-            of its global variables. By default only if the FMU says that it can be
-            instantiated only once per process. See ``fmugym.trial.trial``.
+            of its global variables.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -94,13 +93,9 @@ class NativePool(AskingPool):
         log: logging.Logger,
         *,
         threads: int | None = None,
-        private_libraries: bool | None = None,
+        private_libraries: bool = False,
     ) -> None:
-        capabilities = fmu.description.capabilities
         spec = spec.fitting(fmu.description)
-        if private_libraries is None:
-            once = capabilities.can_be_instantiated_only_once_per_process
-            private_libraries = once and num_instances > 1
         self._use(new_arrays(spec, num_instances))
         self.threads = available_processors() if threads is None else max(1, threads)
         self._result = self.outputs, self.statuses
@@ -113,7 +108,7 @@ class NativePool(AskingPool):
             fmu.close()
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
-        self._prepare_saving(fmu.description, spec)
+        self._prepare(fmu, spec, log)
         self._answers = Answers(fmu.description, spec, slice(0, num_instances))
         self.step_own = self._pool.step_own
         self._reset = self._pool.reset

@@ -23,13 +23,15 @@ __all__ = ["RetryingPool"]
 class RetryingPool(CountedPool):
     """A pool whose resets may be tried again while licences are refused."""
 
-    _told: tuple[str, logging.Logger] | None = None
+    _patience: tuple[str, logging.Logger] | None = None
+    """The FMU's name, and a logger that is told what takes long; None if resets are done once."""
+
     _release: Callable[[], None] | None = None
 
     @property
     def retries_resets(self) -> bool:
         """See ``Pool.retries_resets``."""
-        return self._told is not None
+        return self._patience is not None
 
     def hold(self, release: Callable[[], None]) -> None:
         """Keep the claim of the instances until ``close``, which releases it."""
@@ -39,26 +41,14 @@ class RetryingPool(CountedPool):
         if self._release is not None:
             self._release()
 
-    def retry_resets(self, name: str, log: logging.Logger) -> None:
-        """From now on, try resets again while licences are refused, and tell what takes long.
-
-        Nothing changes if the pool neither waits for licences nor tells of slow resets.
-
-        Args:
-            name: The FMU, for messages.
-            log: Is told what this waits for.
-        """
-        if self._spec.licence_wait or log.isEnabledFor(logging.INFO):
-            self._told = name, log
-
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        if self._told is None:
+        if self._patience is None:
             self._reset_some(variables, values, mask)
         else:
-            self._reset_patiently(*self._told, variables, values, mask)
+            self._reset_patiently(*self._patience, variables, values, mask)
         return self.outputs, self.statuses
 
     def _reset_some(

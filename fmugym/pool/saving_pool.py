@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
+from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
@@ -53,19 +54,21 @@ def offered_method(description: ModelDescription, spec: PoolSpec) -> SaveMethod:
 class SavingPool(RetryingPool):
     """A pool that saves states, or keeps the inputs of episodes to play them again.
 
-    A subclass calls ``_prepare_saving`` in its constructor.
+    A subclass calls ``_prepare`` in its constructor.
     """
 
     _form: tuple[ModelDescription, PoolSpec]
     _offered = SaveMethod.REPLAY
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
-    def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> None:
-        """Take over what saving needs."""
-        self._form = description, spec
+    def _prepare(self, fmu: FMU, spec: PoolSpec, log: logging.Logger) -> None:
+        """Keep what resets and saving need."""
+        self._form = fmu.description, spec
         self._numbers: Iterator[int] = itertools.count(1)
         self._dropped: deque[int] = deque()
-        self._offered = offered_method(description, spec)
+        self._offered = offered_method(fmu.description, spec)
+        if spec.licence_wait or log.isEnabledFor(logging.INFO):
+            self._patience = fmu.path.name, log
 
     def save_by(self, ask_for_method: Callable[[], SaveMethod]) -> None:
         """Let the first call that saves or restores ask which method works."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,8 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.around import play_around
 from fmugym.pool.base import FloatArray, MaskArray, Play, Pool, PoolSpec, StatusArray
 from fmugym.pool.spec import ResetMethod
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 __all__ = ["Course", "Courses", "RecordingPool"]
 
@@ -54,13 +56,18 @@ class Courses:
     def __init__(self) -> None:
         self._open: list[_Open] = []
 
-    def make_pool(
-        self, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger, **options: Any
+    def open_pool(
+        self,
+        fmu: FMU,
+        spec: PoolSpec,
+        num_instances: int,
+        log: logging.Logger,
+        options: PoolOptions,
     ) -> RecordingPool:
-        """Make a pool of the FMU whose courses are kept; see ``fmugym.trial.opening.make_pool``."""
+        """Open a pool of the FMU whose courses are kept; see ``fmugym.trial.opening.open_pool``."""
         self.spec = spec
-        options["backend"] = "auto"
-        return RecordingPool(make_pool(fmu, spec, num_instances, log, **options), spec, self)
+        options = replace(options, backend="auto")
+        return RecordingPool(open_pool(fmu, spec, num_instances, log, options), spec, self)
 
     def begin(self, starts: FloatArray, outputs: FloatArray) -> _Open:
         """Begin a course, to which ``RecordingPool`` adds steps."""
@@ -96,6 +103,7 @@ class RecordingPool(Pool):
     def __init__(self, pool: Pool, spec: PoolSpec, courses: Courses) -> None:
         self._pool, self._spec, self._courses = pool, spec, courses
         self.num_instances, self.step_own = pool.num_instances, self._step_own
+        self.execution = pool.execution
         self.inputs, self.outputs = pool.inputs, pool.outputs
         self.statuses, self.observations = pool.statuses, pool.observations
         self._now: list[Any] = [None] * pool.num_instances

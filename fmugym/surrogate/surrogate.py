@@ -19,6 +19,7 @@ from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.surrogate_pool import SurrogatePool
 from fmugym.surrogate.terms import Terms, rows_in
+from fmugym.trial.pool_options import PoolOptions
 
 __all__ = ["Surrogate"]
 
@@ -48,11 +49,18 @@ class Surrogate:
     spec: PoolSpec
     variables: tuple[Variable, ...]
 
-    def make_pool(
-        self, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger, **options: Any
+    def open_pool(
+        self,
+        fmu: FMU,
+        spec: PoolSpec,
+        num_instances: int,
+        log: logging.Logger,
+        options: PoolOptions,
     ) -> SurrogatePool:
-        """Make a pool that the surrogate steps; see ``fmugym.trial.opening.make_pool``."""
-        return SurrogatePool(self.terms, self.start, self.runs, fmu, spec, num_instances)
+        """Open a pool that the surrogate steps; see ``fmugym.trial.opening.open_pool``."""
+        pool = SurrogatePool(self.terms, self.start, self.runs, fmu, spec, num_instances)
+        pool.execution = (f"{fmu.path.name}: a surrogate steps in its place",)
+        return pool
 
     def programs(self) -> tuple[list[Program], list[float]]:
         """The programs of a step, of the factors and of each output, and their numbers.

@@ -18,7 +18,8 @@ from weakref import WeakSet
 
 from gymnasium import spaces
 
-from fmugym.checks import check_mapping
+from fmugym.archive.fmu import FMU
+from fmugym.checks import check_mapping, check_option
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, support_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name, warn_once
@@ -26,7 +27,7 @@ from fmugym.expressions.by_numpy import hooks_of
 from fmugym.expressions.formulas import Formulas
 from fmugym.expressions.quantities import KEPT
 from fmugym.expressions.value import Value
-from fmugym.pool import Pool, PoolSpec
+from fmugym.pool import ISOLATIONS, Pool, PoolSpec
 from fmugym.systems import FMUSystem
 from fmugym.task.class_formulas import class_formulas, with_monitors
 from fmugym.task.conversions import Conversions
@@ -38,7 +39,12 @@ from fmugym.task.interface import Interface, resolve
 from fmugym.task.own_hooks import OwnHooks, is_overridden
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
-from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
+from fmugym.task.pool_opening import (
+    env_numbers,
+    open_env_pool,
+    open_fmu,
+    pools_are_deferred,
+)
 from fmugym.task.snapshot import Scope
 from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, NamedValues
@@ -57,7 +63,8 @@ class Constructed(Pictured):
     Attributes:
         interface: The variables of the config, as the FMU has them.
         pool_spec: The work of the pool at each reset and step: step sizes, variables, solver.
-        pool_opening: Opens pools for this environment.
+        backend: As it was given; None for a pool of the FMU.
+        isolation: As it was given; None for that of the config.
         pool: The pool that has the FMU.
         episode_start: The values with which episodes start, constant or drawn.
         formulas: The expressions of the task as values of a graph; None without expressions.
@@ -108,7 +115,8 @@ class Constructed(Pictured):
 
     # The FMU and its episode.
 
-    pool_opening: PoolOpening
+    backend: Any
+    isolation: str | None
     _instance: Instance
     """While the pool is open."""
 
@@ -174,17 +182,11 @@ class Constructed(Pictured):
 
     def _open(self, backend: Any, isolation: str | None) -> None:
         """Open the pool, unless a vector environment is going to give one."""
-        self.pool_opening = PoolOpening(
-            self.fmu,
-            self.pool_spec,
-            self.config,
-            self.episode_start,
-            self.logger,
-            backend,
-            isolation,
-        )
+        if isolation is not None:
+            check_option("isolation", isolation, ISOLATIONS)
+        self.backend, self.isolation = backend, isolation
         if not pools_are_deferred():
-            self._use(self.pool_opening.open())
+            self._use(open_env_pool(self))
 
     @property
     def _is_open(self) -> bool:
@@ -221,9 +223,8 @@ class Constructed(Pictured):
             require_construction(self)
             if self._is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-            self.pool_opening = self.pool_opening.apart()
-            self.fmu = self.pool_opening.fmu
-            self._use(self.pool_opening.open())
+            self.fmu = FMU.of(self.fmu)  # which others may share
+            self._use(open_env_pool(self))
         return self._instance.pool
 
     @property
@@ -322,7 +323,7 @@ def require_construction(env: Constructed) -> None:
     Raises:
         ConfigError: If it has not.
     """
-    if not hasattr(env, "pool_opening"):
+    if "backend" not in vars(env):
         name = type(env).__name__
         raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 

@@ -1,32 +1,35 @@
-"""Opening of an environment's FMU and of its pool."""
+"""Opening of an environment's FMU, and of its pool."""
 
 from __future__ import annotations
 
 import inspect
-import logging
 import os
 from abc import ABCMeta
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
 from itertools import count, takewhile
-from math import floor, isfinite
 from pathlib import Path
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.checks import check_option, check_path
+from fmugym.checks import check_path
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError
-from fmugym.pool import Pool, PoolSpec
-from fmugym.pool.spec import ISOLATIONS
+from fmugym.pool import Pool
 from fmugym.systems import FMUSystem
-from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.starting import structural_values
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
-__all__ = ["PoolOpening", "deferred_pools", "env_numbers", "open_fmu", "pools_are_deferred"]
+__all__ = [
+    "deferred_pools",
+    "env_numbers",
+    "open_env_pool",
+    "open_fmu",
+    "pool_options",
+    "pools_are_deferred",
+]
 
 env_numbers: Final = count()
 """Numbers of environments in the order in which they are made."""
@@ -141,80 +144,44 @@ def _interface_of(cls: type, wanted: str | None, own: str | None) -> str | None:
     return wanted or own
 
 
-@dataclass(frozen=True)
-class PoolOpening:
-    """What it takes to open the pool of an environment.
+def open_env_pool(env: Any, num_instances: int = 1, **given: Any) -> Pool:
+    """Open a pool for an environment, or for N of its kind.
 
     Args:
-        fmu: The FMU; closed with the pool.
-        spec: What to do at each reset and step.
-        config: The environment's config.
-        draws: The draws of its episodes, for the trial of resets.
-        log: The logger that gets the FMU's messages.
-        backend: See ``FMUEnv``.
-        isolation: See ``FMUEnv``.
+        env: The environment; its FMU is closed with the pool.
+        num_instances: N.
+        given: As for ``pool_options``.
 
     Raises:
-        ConfigError: If there is no isolation of this name.
+        ConfigError: If an argument is invalid.
+        FMULoadError: If the FMU cannot be used on this machine.
     """
+    options = pool_options(env, **given)
+    return open_pool(env.fmu, env.pool_spec, num_instances, env.logger, options)
 
-    fmu: FMU
-    spec: PoolSpec
-    config: EnvConfig
-    draws: EpisodeStart
-    log: logging.Logger
-    backend: Any
-    isolation: str | None
 
-    def __post_init__(self) -> None:
-        if self.isolation is not None:
-            check_option("isolation", self.isolation, ISOLATIONS)
+def pool_options(env: Any, *, max_episode_steps: int | None = None, **given: Any) -> PoolOptions:
+    """The options of an environment's pool.
 
-    def open(
-        self, num_instances: int = 1, *, max_episode_steps: int | None = None, **options: Any
-    ) -> Pool:
-        """Open a pool.
+    Args:
+        env: The environment.
+        max_episode_steps: The most steps of an episode, if the config does not limit it more.
+        given: Options before those of the config; the environment's own backend is before both.
 
-        Args:
-            num_instances: N.
-            max_episode_steps: The most steps of an episode, if the config does not limit it more.
-            options: Wishes of ``fmugym.pool.wishes.Wishes``, before the config's own.
-
-        Raises:
-            ConfigError: If an argument is invalid.
-            FMULoadError: If the FMU cannot be used on this machine.
-        """
-        most = self.config.foreign.max_instances
-        if most is not None and num_instances > most:
-            raise ConfigError(
-                f"{self.fmu.path.name}: {num_instances} environments need {num_instances} "
-                f"instances, but 'max_instances' of 'foreign' allows {most}"
-            )
-        own: dict[str, Any] = {
-            "isolation": self.isolation or self.config.isolation,
-            "call_timeout": self.config.foreign.call_timeout,
-            "reset_method": self.config.foreign.reset_method,
-            "starts": self.draws.starts(),
-            "length": self._length(max_episode_steps),
-            "spare": most is None or num_instances < most,
-        }
-        options = own | options
-        if self.backend is not None:
-            options["backend"] = self.backend
-        return make_pool(self.fmu, self.spec, num_instances, self.log, **options)
-
-    def _length(self, max_episode_steps: int | None) -> int | None:
-        """The most steps of an episode; None if nothing limits them."""
-        limits = [max_episode_steps, self.config.max_episode_steps]
-        if self.spec.stop_time is not None:
-            span = self.spec.stop_time - self.spec.start_time
-            steps = span / self.spec.time_step
-            limits.append(max(1, floor(steps + 1e-9)) if isfinite(steps) else None)
-        return min((limit for limit in limits if limit is not None), default=None)
-
-    def apart(self) -> PoolOpening:
-        """Return the same with an FMU that is not shared."""
-        return replace(self, fmu=FMU.of(self.fmu))
+    Raises:
+        ConfigError: If an option is invalid.
+    """
+    config = env.config
+    limits = (max_episode_steps, config.max_episode_steps)
+    own: dict[str, Any] = {
+        "isolation": env.isolation or config.isolation,
+        "call_timeout": config.foreign.call_timeout,
+        "reset_method": config.foreign.reset_method,
+        "starts": env.episode_start.starts(),
+        "max_episode_steps": min((one for one in limits if one is not None), default=None),
+    }
+    backend = {} if env.backend is None else {"backend": env.backend}
+    return PoolOptions(**(own | given | backend))
 
 
 def _find_file(cls: type, path: Path) -> Path:

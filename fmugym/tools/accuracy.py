@@ -23,7 +23,9 @@ from fmugym.errors import FMUGymError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
-from fmugym.task.pool_opening import PoolOpening
+from fmugym.task.pool_opening import pool_options
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 __all__ = ["TOLERANCE", "OutputTrajectory", "Replay", "error_of", "substeps_of"]
 
@@ -68,13 +70,17 @@ class Replay:
     """The inputs of an episode, to be repeated.
 
     Attributes:
-        opening: Makes the pool.
-        variables: Variables that are set at the start.
+        fmu: The FMU.
+        spec: The settings of the task.
+        options: Those of the pool.
+        variables: Those that are set at the start.
         starts: Their values, shape (P, 1).
         inputs: The values of the inputs in each step, shape (T, m).
     """
 
-    opening: PoolOpening
+    fmu: FMU
+    spec: PoolSpec
+    options: PoolOptions
     variables: tuple[Variable, ...]
     starts: FloatArray
     inputs: FloatArray
@@ -98,12 +104,8 @@ class Replay:
         rows = np.array(inputs, np.float64).reshape(len(inputs), len(pool.inputs))
         if fails:  # with other settings it may go on
             rows = np.resize(rows, (_STEPS, len(pool.inputs)))
-        return cls(env.pool_opening, draws.model_variables, np.array([starts]).T, rows)
-
-    @property
-    def spec(self) -> PoolSpec:
-        """The settings of the task."""
-        return self.opening.spec
+        variables, values = draws.model_variables, np.array([starts]).T
+        return cls(env.fmu, env.pool_spec, pool_options(env), variables, values, rows)
 
     def run(self, **changes: Any) -> OutputTrajectory | None:
         """Repeat the episode with other settings.
@@ -115,12 +117,12 @@ class Replay:
             What the FMU gave; None if it does not begin with these settings.
         """
         spec = replace(self.spec, warm_up_steps=0, **changes)
-        opening = replace(self.opening, fmu=_untried(self.opening.fmu), spec=spec, log=_silent)
-        isolation = None if opening.fmu.bundled else "process"
+        fmu = _untried(self.fmu)
+        options = replace(self.options, isolation=None if fmu.bundled else "process")
         try:
-            pool = opening.open(1, isolation=isolation)
+            pool = open_pool(fmu, spec, 1, _silent, options)
         except FMUGymError:
-            opening.fmu.close()
+            fmu.close()
             return None
         with closing(pool):
             pool.reset(self.variables, self.starts)
@@ -242,7 +244,7 @@ def _difference(courses: dict[int, OutputTrajectory | None], finest: int, steps:
 
 def _ladder(replay: Replay) -> Iterator[tuple[int, OutputTrajectory | None]]:
     """Courses with 1, 2, 4 ... substeps, until they settle."""
-    internal = replay.opening.fmu.description.fixed_internal_step_size or 0.0
+    internal = replay.fmu.description.fixed_internal_step_size or 0.0
     before, count = None, 1
     while count <= max(_MOST_SUBSTEPS, 2 * replay.spec.substeps):
         if replay.spec.time_step / count < 0.999999 * internal:

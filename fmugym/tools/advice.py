@@ -56,7 +56,7 @@ def advise(replay: Replay) -> Iterator[Advice | CheckResult]:
     time_step = _time_step(replay)
     if time_step is not None:
         yield time_step
-    if replay.opening.fmu.description.interface == "model_exchange":
+    if replay.fmu.description.interface == "model_exchange":
         yield from _of_solvers(replay)
     else:
         yield from _of_substeps(replay)
@@ -174,10 +174,10 @@ def _eigenvalues(replay: Replay) -> _ComplexArray | None:
     """Eigenvalues of the linear model at the start; None if the FMU gives none."""
     names = [variable.name for variable in replay.variables]
     starts = dict(zip(names, replay.starts[:, 0].tolist(), strict=True))
-    verdict = known_verdict(replay.opening.fmu)
+    verdict = known_verdict(replay.fmu)
     if verdict is not None and verdict.isolate:  # it is linearized in this process
         return None
-    own = FMU.of(replay.opening.fmu)
+    own = FMU.of(replay.fmu)
     try:
         return np.linalg.eigvals(linearize(own, at=starts).A).astype(np.complex128)
     except (FMUGymError, np.linalg.LinAlgError):

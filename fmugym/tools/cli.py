@@ -57,7 +57,8 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
   ``noisy_outputs``, the grades of ``resets`` by method, the ``reset_method``, the
   ``component_resets`` of a system by the names of its components, what ``several_instances``
   need, ``isolate``, whether it ``cannot_be_read_before_a_step``, how many ``instances_at_once``
-  and ``initializations`` it used, and its ``findings``, a sentence each; null before
+  and ``initializations`` it used, its ``findings``, and the ``execution`` of pools by default and
+  why, a sentence each; null before
 - ``capabilities``: flags by name, those of ``fmugym.archive.description.Capabilities``
 - ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
 - ``fixed_internal_step_size``: in s

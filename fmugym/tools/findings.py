@@ -61,7 +61,8 @@ class ValidationReport:
             None for a restore that the FMU does not allow.
         hooks: Calls of hooks in a vector environment: ``expressions``, ``arrays`` or
             ``one by one``.
-        reset_method: Method by which episodes begin.
+        execution: Sentences on how the FMU runs, and why.
+        reset_method: How episodes begin.
         recommended: Settings that suit the task, by name.
         advices: Lines for the task file, of these settings.
     """
@@ -69,6 +70,7 @@ class ValidationReport:
     findings: tuple[CheckResult, ...]
     costs: Mapping[str, float | None]
     hooks: str
+    execution: tuple[str, ...]
     reset_method: str
     recommended: Mapping[str, Any]
     advices: tuple[Advice, ...] = ()
@@ -94,7 +96,7 @@ class ValidationReport:
                 lines.append(f"{'':8} cure: {plain(one.cure)}")
         step, reset, restore = (_duration(self.costs[n]) for n in ("step", "reset", "restore"))
         lines.append(f"a step takes {step}, a reset {reset}, to restore a state {restore}")
-        lines.append(f"episodes begin by {self.reset_method}")
+        lines += map(plain, self.execution)
         lines.append(f"hooks in a vector environment: {self.hooks}")
         if "envs" in self.recommended:
             lines.append(f"recommended for a training: --envs {self.recommended['envs']}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -15,9 +16,13 @@ from fmugym.archive.dependencies import missing_tool, note_on
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.episodes.evaluation import aligned
-from fmugym.errors import FMULoadError, first_of, plain
+from fmugym.errors import FMULoadError, plain
+from fmugym.pool.spec import PoolSpec
 from fmugym.series.recorded_quantities import matches
+from fmugym.trial.execution import Execution
 from fmugym.trial.known import known_verdict
+from fmugym.trial.pool_options import PoolOptions
+from fmugym.trial.verdict import MOST_INSTANCES, Verdict
 
 __all__ = ["as_text", "finite_or_none", "headed", "overview", "tables", "typed_start"]
 
@@ -96,7 +101,21 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "instances_at_once": verdict.instances,
         "initializations": verdict.initializations,
         "findings": list(verdict.findings),
+        "execution": _execution(fmu, verdict),
     }
+
+
+def _execution(fmu: FMU, verdict: Verdict) -> list[str]:
+    """Sentences on how one instance and several of them run by default, and why."""
+    spec, options = PoolSpec((), (), 1.0), PoolOptions()
+    counts = (1,) if verdict.neighbours is None else (1, MOST_INSTANCES)
+    told = dict[str, None]()
+    with suppress(FMULoadError):  # the obstacles tell why
+        options = options.fitting(fmu)
+        for count in counts:
+            execution = Execution.decided(fmu, spec, count, options, verdict)
+            told |= dict.fromkeys(execution.sentences)
+    return list(told)
 
 
 def _missing_libraries(fmu: FMU) -> tuple[str, ...]:
@@ -224,19 +243,6 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
         return "none on this machine; the first use tries an FMU, unless fmugym brings it along"
     grades = ", ".join(f"{method} is {_GRADES[g]}" for method, g in trial["resets"].items())
     parts = [grades] if grades else []
-    if trial["reset_method"]:
-        parts.append(f"episodes begin by {trial['reset_method']!r}")
-    if trial["component_resets"]:
-        own = trial["component_resets"].items()
-        parts.append("its components begin " + ", ".join(f"{name} by {m!r}" for name, m in own))
-    if not trial["deterministic"]:
-        parts.append(f"fresh instances differ in {first_of(trial['noisy_outputs'])}")
-    if trial["several_instances"]:
-        parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
-    if trial["cannot_be_read_before_a_step"]:
-        parts.append("it cannot be read before its first step")
-    if trial["isolate"]:
-        parts.append("it harms its process and is isolated")
     count = trial["instances_at_once"]
     parts = parts or ["it survived"]
     parts.append(f"tried with {count} {'instance' if count == 1 else 'instances'} at once")
@@ -250,13 +256,6 @@ _GRADES: Final = {
     "wrong": "wrong",
     "fails": "failing",
     "absent": "not offered",
-}
-_NEEDS: Final = {
-    "independent": "independent",
-    "one initialization at a time": "initialized one at a time",
-    "one thread": "one thread for all",
-    "libraries": "a copy of the library each",
-    "processes": "a process each",
 }
 
 
@@ -273,11 +272,12 @@ def _experiment(facts: Mapping[str, Any]) -> str:
 
 
 def _trial_lines(facts: Mapping[str, Any]) -> Iterator[str]:
-    sentences = (facts["trial"] or {}).get("findings", ())
-    if sentences:
-        yield "\nFirst meeting"
-    for sentence in sentences:
-        yield f"  - {plain(sentence)}"
+    for key, heading in (("findings", "First meeting"), ("execution", "Execution")):
+        sentences = (facts["trial"] or {}).get(key, ())
+        if sentences:
+            yield f"\n{heading}"
+        for sentence in sentences:
+            yield f"  - {plain(sentence)}"
 
 
 def _findings(findings: Sequence[str], most: int | None) -> Iterator[str]:

@@ -112,7 +112,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> ValidationReport:
             "reset": _play(env, env.action_space.sample, most_steps=0).reset_time,
             "restore": _restore_time(env),
         }
-        hooks = _hooks(make_env)
+        hooks, execution = _hooks(make_env), env.pool.execution
         recommended = _recommended(env, first.step_time, hooks, findings)
         others = [*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards)]
         replay = Replay.of(env)
@@ -123,7 +123,13 @@ def validate(make_env: Callable[[], FMUEnv]) -> ValidationReport:
     before = (one for one in findings if one.verdict != "ok" or one.check not in checks)
     recommended |= {one.key: one.value for one in advices}
     return ValidationReport(
-        (*before, *more), costs, hooks, recommended["reset_method"], recommended, tuple(advices)
+        (*before, *more),
+        costs,
+        hooks,
+        execution,
+        recommended["reset_method"],
+        recommended,
+        tuple(advices),
     )
 
 

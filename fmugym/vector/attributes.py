@@ -25,7 +25,16 @@ _TOGETHER: Final = frozenset({"close", "reset", "step"})
 
 _KEPT_FOR_ALL: Final = frozenset(READABLE) | {
     *("action_space", "config", "fmu", "logger", "metadata", "observation_space"),
-    *("render_mode", "spec", "interface", "pool_spec", "pool_opening", "pool", "episode_start"),
+    *(
+        "render_mode",
+        "spec",
+        "interface",
+        "pool_spec",
+        "backend",
+        "isolation",
+        "pool",
+        "episode_start",
+    ),
     *("formulas", "resolved", "step_limit", "warm_up", "warm_up_steps", "planning_model"),
 }
 """Attributes that ``FMUEnv`` sets itself."""

@@ -12,7 +12,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import PoolSpec
 from fmugym.task.construction import require_construction
-from fmugym.task.pool_opening import deferred_pools, env_numbers
+from fmugym.task.pool_opening import deferred_pools, env_numbers, open_env_pool
 
 __all__ = ["EnvMaker", "make_with_pool"]
 
@@ -23,7 +23,7 @@ def make_with_pool(make_env: Callable[[], Any], num_instances: int = 1, **option
     Args:
         make_env: A function without arguments that returns a new environment.
         num_instances: N.
-        options: See ``PoolOpening.open``.
+        options: See ``open_env_pool``.
 
     Raises:
         ConfigError: If an argument does not fit.
@@ -31,7 +31,7 @@ def make_with_pool(make_env: Callable[[], Any], num_instances: int = 1, **option
     """
     env = EnvMaker(make_env).make()
     require_construction(env)
-    env._use(env.pool_opening.open(num_instances, **options))
+    env._use(open_env_pool(env, num_instances, **options))
     return env
 
 

@@ -19,6 +19,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool import Pool
 from fmugym.pool.base import MaskArray
 from fmugym.task.construction import prepare_hooks, require_construction
+from fmugym.task.pool_opening import open_env_pool
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.specs import EpisodeLimit
@@ -73,7 +74,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ``infos["final_obs"]``, in the form of observations, and ``infos["final_info"]``, where
             ``infos["_final_obs"]`` is true) or ``DISABLED`` (``reset`` with
             ``options["reset_mask"]`` must follow).
-        pool_options: Wishes of ``fmugym.pool.wishes.Wishes``: ``backend``, ``threads``,
+        pool_options: Of ``fmugym.trial.pool_options.PoolOptions``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
     Attributes:
@@ -143,8 +144,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         env = self.prototype
         try:
             require_own_order(env)
-            self.pool = env.pool_opening.open(
-                self.num_envs, max_episode_steps=max_episode_steps, **pool_options
+            self.pool = open_env_pool(
+                env, self.num_envs, max_episode_steps=max_episode_steps, **pool_options
             )
             try:
                 env._use(self.pool)

@@ -18,8 +18,8 @@ from ways import in_way
 
 import fmugym
 import fmugym.lab
-from fmugym.pool.wishes import Wishes
 from fmugym.task.hooks import Hooks
+from fmugym.trial.pool_options import PoolOptions
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -213,8 +213,9 @@ def test_docstrings_describe_every_argument_of_vector_environments():
     own = inspect.signature(fmugym.FMUVectorEnv.__init__).parameters
     described = re.findall(r"^ {8}(\w+): ", fmugym.FMUVectorEnv.__doc__, re.M)
     assert set(own) - {"self"} <= set(described)
-    wishes = re.findall(r"^ {8}(\w+): ", Wishes.__doc__, re.M)
-    assert {wish.name for wish in dataclasses.fields(Wishes)} == set(wishes)
+    attributes = PoolOptions.__doc__.split("Raises:")[0]
+    options = re.findall(r"^ {8}(\w+): ", attributes, re.M)
+    assert {option.name for option in dataclasses.fields(PoolOptions)} == set(options)
 
 
 def test_table_of_shapes_is_what_hooks_see():

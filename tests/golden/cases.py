@@ -1,6 +1,6 @@
 """What the golden results are of: pools and tasks that play a few steps of many FMUs.
 
-Each case is a function of a folder for FMUs and of the keyword arguments of ``local_pool``. Of a
+Each case is a function of a folder for FMUs and of the keyword arguments of ``NativePool``. Of a
 pool it returns the outputs after each call: those of a reset and of some steps of two instances, a
 reset of the first of them alone, more steps, and the steps after a snapshot once more; where FMUs
 fail, the statuses of all calls, too. Of a task it returns what is observed, rewards and ends.
@@ -32,7 +32,7 @@ from fmugym import FMU, FMUGymError
 from fmugym.archive.bundled import BUNDLED_FMUS, bundled_fmu
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, START_TIME
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import MASTERS
@@ -87,7 +87,7 @@ def played(fmu, inputs, outputs, starts, time_step, options, samplings=None, **s
     given, read = (tuple(map(fmu.variable, names)) for names in (inputs, outputs))
     read = sampled(read, samplings)
     start = tuple(START_TIME if name is START_TIME else fmu.variable(name) for name in starts)
-    with closing(local_pool(fmu, PoolSpec(given, read, time_step, **spec), 2, LOG, **options)) as p:
+    with closing(NativePool(fmu, PoolSpec(given, read, time_step, **spec), 2, LOG, **options)) as p:
         return play(p, start, len(inputs))
 
 
@@ -195,7 +195,7 @@ def fault(name, version, folder, **options):
     variables = tuple(map(fmu.variable, ("u", "y", *wrong)))
     made = PoolSpec(variables[:1], variables[1:2], 0.5, fault_retries=int(version > 1))
     starts = np.repeat([[value] for value in wrong.values()], 2, axis=1)
-    with closing(local_pool(fmu, made, 2, LOG, **options)) as pool:
+    with closing(NativePool(fmu, made, 2, LOG, **options)) as pool:
         calls = [
             partial(pool.reset, variables[2:], starts),
             *[partial(pool.step, np.ones((1, 2)))] * 3,

@@ -1,5 +1,6 @@
 """The native pool: threads, messages, isolation and memory."""
 
+import functools
 import gc
 import logging
 import os
@@ -18,6 +19,8 @@ from fmugym.archive.bundled import BUNDLED_FMUS
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 from fmugym.trial.trial import compare
 from fmugym.trial.verdict import Neighbours
 
@@ -353,10 +356,11 @@ class TestIsolation:
         pool.close()
         assert list(temp_root.iterdir()) == []
 
-    def test_by_the_flag(self, native, tmp_path):
+    def test_by_the_flag(self, opened, tmp_path):
         flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
         path = busy_fmu(tmp_path, "-DSHARED", flags=flag)
-        assert self.run(native(path, ["work"], ["total"], 3)) == [3, 3, 3]
+        cls = functools.partial(open_pool, options=PoolOptions(isolation="none"))
+        assert self.run(opened(make(cls, path, ["work"], ["total"], 3))) == [3, 3, 3]
 
     def test_where_no_copy_can_be_made(self, native, shared, monkeypatch):
         def full(*_, **options):

@@ -27,7 +27,8 @@ from ways import in_way
 
 from fmugym import FMU, FMUGymError
 from fmugym.pool import PoolSpec
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 from fmugym.vector import FMUVectorEnv
 
 LOG = logging.getLogger("fmugym.test")
@@ -231,7 +232,7 @@ class PoolMachine(Machine):
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.5, **self.options)
         self.snapshots = []
         self.gain = fmu.variable("k")
-        return make_pool(fmu, spec, N, LOG, private_libraries=False)
+        return open_pool(fmu, spec, N, LOG, PoolOptions(private_libraries=False))
 
     @rule(gain=GAINS, mask=st.none() | MASKS)
     def reset(self, gain, mask):

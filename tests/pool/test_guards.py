@@ -20,7 +20,7 @@ with_state = pytest.mark.parametrize("version", [2, 3])
 
 @pytest.fixture(name="way", params=KINDS)
 def fixture_way(request):
-    """The options of ``make_pool`` for each pool."""
+    """``PoolOptions`` for each pool."""
     return KINDS[request.param]
 
 

@@ -11,7 +11,8 @@ from process_tools import posix_only
 from fmugym import FMU, FMULoadError, FMUSystem
 from fmugym.pool import PoolSpec
 from fmugym.pool.spec import ResetMethod
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 LOG = logging.getLogger("fmugym.test")
 VARIABLES = (("u", "input", 'start="0"'), ("y", "output", ""))
@@ -29,7 +30,9 @@ def fixture_make(opened):
         fmu = FMU(fmu) if not isinstance(fmu, FMU) else fmu
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), time_step=0.5)
         spec = spec.beginning_by(ResetMethod(method))
-        return opened(make_pool(fmu, spec, num_instances, LOG, reset_method=method, **options))
+        return opened(
+            open_pool(fmu, spec, num_instances, LOG, PoolOptions(reset_method=method, **options))
+        )
 
     return make
 
@@ -112,9 +115,8 @@ def test_of_a_system(make, tmp_path):
         components={"first": path, "second": path}, connections=["first.y -> second.u"]
     ).as_fmu()
     spec = PoolSpec((system.variable("first.u"),), (system.variable("second.y"),), time_step=0.5)
-    pool = make_pool(
-        system, spec.beginning_by(ResetMethod.INSTANCE), 1, LOG, reset_method="instance"
-    )
+    spec, options = spec.beginning_by(ResetMethod.INSTANCE), PoolOptions(reset_method="instance")
+    pool = open_pool(system, spec, 1, LOG, options)
     for _ in range(2 * LIMIT):
         _, statuses = pool.reset((), np.zeros((0, 1)))
         assert not statuses.any(), pool.failure(0)

@@ -27,7 +27,7 @@ OPTIONS = {
     "process": {"backend": "auto", "isolation": "process", "workers": 2},
     "wine": {"backend": "auto", "workers": 2},
 }
-"""Of ``make_pool``, by implementation."""
+"""``PoolOptions``, by implementation."""
 
 OPTIONS |= {f"system in {name}": OPTIONS[name] for name in ("native", "process")}
 """With the FMU as a component of a system."""

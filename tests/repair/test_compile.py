@@ -28,7 +28,7 @@ def source_fmu(tmp_path):
 def simulated(path, interface):
     fmu = FMU(path, interface=interface, probe_timeout=None)
     spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=0.1)
-    with closing(opening.make_pool(fmu, spec, 2, logging.getLogger("fmugym.test"))) as pool:
+    with closing(opening.open_pool(fmu, spec, 2, logging.getLogger("fmugym.test"))) as pool:
         pool.reset((), np.zeros((0, 2)))
         return [pool.step(np.array([[u, -u]]))[0].copy() for u in (0.0, 1.0, 2.0)]
 

@@ -91,7 +91,7 @@ def test_it_is_the_difference_quotient_of_houses_in_a_loop():
 def test_an_isolated_system_gives_the_same(monkeypatch):
     one = linearize(FMUSystem({"a": HOUSE}))
     # That would load it into this process.
-    monkeypatch.setattr("fmugym.linearization.models.local_pool", None)
+    monkeypatch.setattr("fmugym.pool.native.NativePool", None)
     other = linearize(FMUSystem({"a": Component(HOUSE, isolate=True)}))
     for name in ("A", "B", "f", "x0", "u0"):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()

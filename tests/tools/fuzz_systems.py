@@ -21,7 +21,7 @@ from system_tools import MATRICES, linear_fmu
 from fmugym import Component, Connection, FMUSystem, SimulationError
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 from fmugym.pool.spec import ResetMethod
 
 LOG = logging.getLogger("fmugym.test")
@@ -102,7 +102,7 @@ class Pools:
         self.pools, self.snapshots = [], None
         try:
             for count in (COUNT, *[1] * COUNT):
-                pool = local_pool(system.as_fmu(), spec, count, LOG)
+                pool = NativePool(system.as_fmu(), spec, count, LOG)
                 pool.save_by(lambda: SaveMethod.STATE)
                 self.pools.append(pool)
         except BaseException:

@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 
 from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 from fmugym.trial import opening
+from fmugym.trial.pool_options import PoolOptions
 
 LOG = logging.getLogger("fmugym.test")
 KINDS = {
     "native": {"backend": "native"},
     "process": {"isolation": "process", "workers": 1},
 }
-"""The arguments by which ``make_pool`` makes each kind."""
+"""The arguments by which ``PoolOptions`` makes each kind."""
 
 
 def sampled(variables, samplings):
@@ -35,14 +36,14 @@ def open_pool(
     samplings=None,
     **spec,
 ):
-    """Open a pool, in this process or with options of ``make_pool``.
+    """Open a pool, in this process or with options of ``PoolOptions``.
 
     Args:
         fmu: The FMU; ``pool.variable`` looks up its variables.
         inputs, outputs: Names.
         time_step: In s.
         n: How many instances.
-        options: Of ``make_pool``; None for a pool in this process.
+        options: Of ``PoolOptions``; None for a pool in this process.
         private: Whether each instance of a pool in this process has a library of its own.
         samplings: One for each output; None for the last values of all.
         spec: Others of a ``PoolSpec``.
@@ -51,9 +52,9 @@ def open_pool(
     read = sampled(read, samplings)
     spec = PoolSpec(given, read, time_step, **spec)
     if options is None:
-        pool = local_pool(fmu, spec, n, LOG, private_libraries=private)
+        pool = NativePool(fmu, spec, n, LOG, private_libraries=private)
     else:
-        pool = opening.make_pool(fmu, spec, n, LOG, **options)
+        pool = opening.open_pool(fmu, spec, n, LOG, PoolOptions(**options))
     pool.variable = fmu.variable
     return pool
 

@@ -80,7 +80,7 @@ class TestOneInitializationAtATime:
         path = make_fmu(folder, "strtok")
         fmugym.FMUVectorEnv(lambda: DemandingEnv(path), 2).close()
         assert known_verdict(fmugym.FMU(path)).neighbours is Neighbours.ONE_INITIALIZATION
-        assert "several instances: initialized one at a time" in ran("info", path)
+        assert "its instances are initialized one at a time" in ran("info", path)
 
 
 class TestGrades:

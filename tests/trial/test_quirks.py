@@ -24,10 +24,10 @@ from ways import in_way
 
 import fmugym
 from fmugym.errors import ContractError
-from fmugym.pool.local import local_pool
+from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
-from fmugym.trial import plan as trial_plan
+from fmugym.trial import execution
 from fmugym.trial.known import known_verdict
 from fmugym.trial.trial import examine
 from fmugym.trial.trial_episodes import Inputs
@@ -154,7 +154,7 @@ class TestEpisodes:
 @pytest.fixture
 def nothing_warned(monkeypatch):
     """A process that has not warned of any FMU yet."""
-    monkeypatch.setattr(trial_plan, "_warned", set())
+    monkeypatch.setattr(execution, "_told", set())
 
 
 @cases
@@ -182,7 +182,7 @@ def test_outputs_before_the_first_step_are_start_values(make_fmu):
     outputs = [replace(fmu.variable(name), start=start) for name, start in START_OUTPUTS.items()]
     spec = PoolSpec((fmu.variable("u"),), tuple(outputs), STEP, blind_start=True)
     spec = replace(spec, reset_method=ResetMethod.RESTORE)
-    pool = local_pool(fmu, spec, 2, logging.getLogger())
+    pool = NativePool(fmu, spec, 2, logging.getLogger())
     for _ in range(4):
         outputs, statuses = pool.reset((), np.zeros((0, 2)))
         assert outputs.tolist() == [[0.75, 0.75], [0.0, 0.0]]

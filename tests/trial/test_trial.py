@@ -24,7 +24,8 @@ from fmugym.pool.process import launcher
 from fmugym.pool.process.output import describe_exit
 from fmugym.trial import trial, workers
 from fmugym.trial.known import known_verdict
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="its faults are those of Unix")
 
@@ -180,7 +181,7 @@ class TestIsolated:
         for _ in range(2):  # what one instance survives is remembered
             fmu = FMU(path)
             log = logging.getLogger("test")
-            pool = make_pool(fmu, spec_of(fmu), 3, log, isolation="process")
+            pool = open_pool(fmu, spec_of(fmu), 3, log, PoolOptions(isolation="process"))
             assert len(set(pool.processes())) == 3
             pool.close()
         assert len(started) == tried

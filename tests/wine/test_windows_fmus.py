@@ -25,6 +25,7 @@ from fmugym import FMU, ConfigError, FMULoadError, FMUSystem, bundled_fmu
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial import opening
+from fmugym.trial.pool_options import PoolOptions
 from fmugym.wine import windows_worker
 from fmugym.wine.installation import can_run_windows
 from fmugym.wine.prefix import Wine
@@ -57,7 +58,7 @@ def open_pool(path, num_instances=1, inputs=("f",), outputs=("x", "theta"), **op
     spec = PoolSpec(
         tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), time_step=0.05
     )
-    return opening.make_pool(fmu, spec, num_instances, LOG, **options)
+    return opening.open_pool(fmu, spec, num_instances, LOG, PoolOptions(**options))
 
 
 def is_locked(file):
@@ -348,7 +349,7 @@ class TestInWine:
             both = FMUSystem({"decay": decay, "pendulum": pendulum}, ["decay.x -> pendulum.tau"])
             fmu = both.as_fmu()
             spec = PoolSpec((), (fmu.variable("decay.x"), fmu.variable("pendulum.theta")), 0.05)
-            pool = opened(opening.make_pool(fmu, spec, 3, LOG))
+            pool = opened(opening.open_pool(fmu, spec, 3, LOG))
             pool.reset((fmu.variable("decay.k"),), np.array([[0.5, 1.0, 2.0]]))
             for _ in range(20):
                 outputs, statuses = pool.step()
@@ -372,7 +373,7 @@ class TestInWine:
         variables = tuple(map(fmu.variable, start_values()))
         values = np.array([list(start_values("leak", "reset").values())], float).T
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1, leak_limit=2**20)
-        pool = opened(opening.make_pool(fmu, spec, 1, LOG))
+        pool = opened(opening.open_pool(fmu, spec, 1, LOG))
         processes = set()
         for _ in range(30):
             pool.reset(variables, values)

@@ -62,6 +62,8 @@ class BackendPool(CountedPool):
     def __init__(
         self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any, *, is_real: bool = True
     ) -> None:
+        if spec.fault_retries:
+            raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
         if spec.samplings and not getattr(backend, "samples_outputs", False):
             raise ConfigError("a backend has no substeps: leave 'samplings' out of the config")
         self._use(new_arrays(spec, num_instances))

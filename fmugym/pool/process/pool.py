@@ -110,7 +110,7 @@ class ProcessPool(AskingPool):
         except BaseException:
             fmu.close()
             raise
-        self._prepare_saving(fmu.description, spec)
+        self._prepare(fmu, spec, log)
         single = self.workers == 1
         arrays = memories[0].arrays if single else new_arrays(spec, num_instances)
         self._use(arrays)

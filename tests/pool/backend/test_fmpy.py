@@ -17,7 +17,8 @@ import fmugym
 from fmugym import ConfigError, FMULoadError, FMUSystem, bundled_fmu
 from fmugym.archive.bundled import BUNDLED_FMUS
 from fmugym.pool import PoolSpec
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 PENDULUM = bundled_fmu("Pendulum")
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
@@ -175,7 +176,9 @@ class TestRefusals:
     def test_of_systems(self):
         both = FMUSystem({"one": PENDULUM, "other": PENDULUM}, []).as_fmu()
         with pytest.raises(ConfigError, match="a system"):
-            make_pool(both, PoolSpec((), (), 0.1), 1, logging.getLogger("test"), backend="fmpy")
+            open_pool(
+                both, PoolSpec((), (), 0.1), 1, logging.getLogger("test"), PoolOptions("fmpy")
+            )
 
     def test_of_snapshots(self):
         env = gym.make("fmugym/Pendulum-v0", backend="fmpy").unwrapped

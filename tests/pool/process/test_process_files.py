@@ -12,7 +12,8 @@ from process_tools import linux_only
 
 from fmugym import FMU
 from fmugym.pool import PoolSpec
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 LOG = logging.getLogger("fmugym.test")
 VARIABLES = (
@@ -41,7 +42,7 @@ def fixture_make(opened):
         fmu = FMU(path)
         spec = PoolSpec((fmu.variable("u"),), tuple(map(fmu.variable, ["y", "gain", "lines"])), 0.5)
         options = {"isolation": "process", "workers": num_instances} | options
-        return opened(make_pool(fmu, spec, num_instances, LOG, **options))
+        return opened(open_pool(fmu, spec, num_instances, LOG, PoolOptions(**options)))
 
     return make
 

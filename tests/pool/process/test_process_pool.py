@@ -40,6 +40,7 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.requests import Request
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial import opening
+from fmugym.trial.pool_options import PoolOptions
 
 LOG = logging.getLogger("fmugym.test")
 
@@ -71,7 +72,7 @@ def fixture_make_pool(faulty, opened):
         outputs = tuple(map(fmu.variable, ["y", "fault"]))
         spec = PoolSpec((fmu.variable("u"),), outputs, time_step=0.5, num_observed=1)
         options = {"isolation": "process", "workers": 2, "call_timeout": 20.0} | options
-        return opened(opening.make_pool(fmu, spec, num_instances, LOG, **options))
+        return opened(opening.open_pool(fmu, spec, num_instances, LOG, PoolOptions(**options)))
 
     return make
 
@@ -93,12 +94,13 @@ import signal, sys
 from test_process_pool import LOG, set_up, step
 from fmugym import FMU
 from fmugym.pool import PoolSpec
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import open_pool
+from fmugym.trial.pool_options import PoolOptions
 
 path = sys.argv[1]
 fmu = FMU(path)
 spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), time_step=0.5)
-pool = make_pool(fmu, spec, 2, LOG, isolation="process", workers=2, call_timeout=None)
+pool = open_pool(fmu, spec, 2, LOG, PoolOptions(isolation="process", workers=2, call_timeout=None))
 set_up(pool, path, ["hang", "none"], at=1)
 
 def interrupt(*_):
