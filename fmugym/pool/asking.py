@@ -1,4 +1,4 @@
-"""Pools of the engine: what they are asked for besides steps and resets is the same everywhere."""
+"""Pools of the engine: their requests besides steps and resets, the same everywhere."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ Played = tuple[Any, int, bool, MaskArray | None]
 
 
 class Play(NamedTuple):
-    """What a pool does that is prepared for a step with programs.
+    """Play of a pool: its step with programs around it.
 
     ``before`` and ``after`` surround a step of the FMUs by the caller, who also starts episodes. A
     pool that steps and starts the FMUs itself has the other functions, too.
@@ -183,7 +183,7 @@ class Pool(ABC):
 
     @property
     def save_method(self) -> SaveMethod | None:
-        """How ``save_instances`` saves; None if the pool cannot do it."""
+        """Method of ``save_instances``; None if the pool cannot save."""
         return None
 
     def save_instances(self, indices: IndexArray) -> Bundle:
@@ -234,7 +234,7 @@ class Pool(ABC):
 
     @property
     def reset_method(self) -> ResetMethod:
-        """How instances start a new episode."""
+        """Method by which instances start a new episode."""
         return ResetMethod.RESET
 
     @property

@@ -42,7 +42,7 @@ NO_SNAPSHOT: Final = 0
 
 
 class SaveMethod(StrEnum):
-    """How a pool saves the states of its instances."""
+    """Method by which a pool saves the states of its instances."""
 
     STATE = "state"
     """The FMU serializes its state. Saving and restoring cost about as much as a step."""
@@ -55,7 +55,7 @@ class SaveMethod(StrEnum):
 
 
 class Head(NamedTuple):
-    """What a state begins with; the outputs follow, and then the FMU's bytes or a record.
+    """Head of a state; the outputs follow, and then the FMU's bytes or a record.
 
     Attributes:
         kind: Whether it has such bytes, or a record, or nothing.
@@ -88,7 +88,7 @@ def head_of(state: bytes) -> Head:
 
 
 def outputs_of(state: bytes, count: int) -> tuple[_FloatArray, bytes]:
-    """Read the outputs of a state, so many of them, and what follows."""
+    """Read the outputs of a state, so many of them, and its rest."""
     end = _HEAD.size + 8 * count
     return np.frombuffer(state[_HEAD.size : end]), state[end:]
 
@@ -146,7 +146,7 @@ class Bundle:
 
     @property
     def method(self) -> SaveMethod:
-        """How the states were saved."""
+        """Method by which the states were saved."""
         if not self.replays:
             return SaveMethod.STATE
         return SaveMethod.REPLAY if self.copies is None else SaveMethod.COPY

@@ -25,7 +25,7 @@ def has_native_pool() -> bool:
 
 
 def needs_engine(doing: str) -> str:
-    """Say in one line that something takes the C extension, and what to install if it is missing.
+    """Say in one line that something takes the C extension, with the cure if it is missing.
 
     Args:
         doing: What it is, the subject of the sentence.
@@ -39,7 +39,7 @@ def needs_engine(doing: str) -> str:
 
 
 def require_engine(doing: str) -> None:
-    """Refuse what only the C extension does where it was not built.
+    """Refuse a feature of the C extension where that was not built.
 
     Args:
         doing: What it is, as for ``needs_engine``.

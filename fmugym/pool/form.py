@@ -104,11 +104,11 @@ class Writer:
         self._parts: list[bytes] = []
 
     def form(self) -> bytes:
-        """What has been written."""
+        """Written bytes."""
         return b"".join(self._parts)
 
     def forms(self, *forms: bytes) -> Self:
-        """Write what others have written."""
+        """Write the content of other writers."""
         self._parts += forms
         return self
 
@@ -206,7 +206,7 @@ def manner_of(description: ModelDescription) -> int:
 
 @dataclass(frozen=True)
 class Files:
-    """Where the files of an FMU, or of the FMUs of a system, are, as their process names them.
+    """Places of the files of an FMU, or of the FMUs of a system, in their process.
 
     Attributes:
         paths: Those of the libraries, or of the private copies.
@@ -306,7 +306,7 @@ def form_of_programs(spec: PoolSpec, count: int, threads: int) -> bytes:
 
 
 def _write_identity(writer: Writer, description: ModelDescription, resources: bytes) -> None:
-    """What the FMU is called, and what it gets with each instance."""
+    """Name of the FMU, and its arguments for each instance."""
     writer.text(description.model_identifier.encode())
     writer.text(description.instantiation_token.encode())
     writer.text(resources)
@@ -317,7 +317,7 @@ def _write_identity(writer: Writer, description: ModelDescription, resources: by
 
 
 def _write_solving(writer: Writer, description: ModelDescription, spec: PoolSpec) -> None:
-    """How the pool solves the equations of an FMU and handles its events, if it has to."""
+    """Settings of the solver of an FMU and of its events."""
     model = description.model_exchange
     is_system = isinstance(description, SystemDescription)  # its components have their own
     solves = not is_system and (model is not None or description.uses_event_mode)
@@ -364,7 +364,7 @@ def _clocks(description: ModelDescription) -> tuple[bytes, bytes]:
 
 
 def _write_experiment(writer: Writer, spec: PoolSpec, records: bool) -> None:
-    """How instances are initialized and stepped, and how episodes begin."""
+    """Settings of initialization, of steps and of the beginning of episodes."""
     method = spec.whole_reset_method
     writer.numbers(spec.start_time)
     writer.optional(spec.stop_time)
@@ -459,7 +459,7 @@ def _write_arrays(writer: Writer, layout: SystemLayout) -> None:
 
 
 def _write_ends(writer: Writer, layout: SystemLayout) -> None:
-    """Where the ends of each variable begin, and all ends."""
+    """Places at which the ends of each variable begin, and all ends."""
     groups = layout.description.ends
     ends = [end for group in groups for end in group]
     numbers = {key: number for number, key in enumerate(layout.arrays)}

@@ -108,7 +108,7 @@ def note(counts: HealthArray, status: int) -> int:
 
 
 class CountedPool(Pool):
-    """A pool that counts what its instances do.
+    """Pool that counts events of its instances.
 
     A subclass sets ``_spec``, and gets its arrays by ``_use``.
     """
@@ -148,7 +148,7 @@ class CountedPool(Pool):
         self._counts[index, Column.NOT_FINITE] += 1
 
     def info(self) -> dict[str, npt.NDArray[Any]]:
-        """See ``Pool.info``: how often the last step was repeated, if steps may be repeated."""
+        """See ``Pool.info``: the repetitions of the last step, if steps may be repeated."""
         if not self._spec.fault_retries:
             return {}
         return {"retries": self._counts[:, Column.RETRIED].copy()}

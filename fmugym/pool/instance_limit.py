@@ -1,4 +1,4 @@
-"""The limit of how many instances of an FMU this process may have, its workers' included.
+"""Limit of the instances of an FMU in this process and its workers.
 
 Each environment that limits its instances claims all that it makes, and so does a trial.
 """

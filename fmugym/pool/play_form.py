@@ -1,4 +1,4 @@
-"""The form of what surrounds the steps of a vector environment; ``native/play_form.c`` reads it."""
+"""Form of the programs around steps of a vector environment; ``native/play_form.c`` reads it."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def _quota_v1(folder: Path) -> float:
 
 
 def _ratio(quota: str, period: str) -> float:
-    """What both are worth; no limit if they are not positive numbers, as ``max`` and ``-1``."""
+    """Ratio of both; no limit if they are not positive numbers, as ``max`` and ``-1``."""
     try:
         values = int(quota), int(period)
     except ValueError:

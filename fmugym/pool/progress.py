@@ -17,7 +17,7 @@ _EVERY: Final = 10.0
 
 @contextmanager
 def progress(log: logging.Logger, call: str) -> Iterator[None]:
-    """Log every ten seconds, at INFO, how long a call in this context has taken.
+    """Log the duration of a call in this context every ten seconds, at INFO.
 
     Args:
         log: The logger.

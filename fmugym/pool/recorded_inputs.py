@@ -58,7 +58,7 @@ _START: Final = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class RecordedInputs:
-    """What an instance was given in its episode until it was saved.
+    """Record of the inputs of an instance in its episode until it was saved.
 
     Attributes:
         variables: Those that were set before initialization.

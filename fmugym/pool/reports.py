@@ -113,7 +113,7 @@ def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:
 
 
 def loading_failed(fmu: str, error: str, folder: Path, processes: str) -> str:
-    """Say why an FMU of this name cannot be loaded from a folder, with what it said.
+    """Explain why an FMU of this name cannot be loaded from a folder, with its messages.
 
     What helps if there are too many instances in a process is said of one that is not the first,
     and where the FMU gave no reason.
@@ -157,5 +157,5 @@ class Receiver:
 
     @property
     def sources(self) -> int:
-        """How many sources of messages an instance has: its components, or itself."""
+        """Number of the sources of messages of an instance: its components, or itself."""
         return len(self._parts)

@@ -54,7 +54,7 @@ class Request(IntEnum):
 
 
 class Answer(IntEnum):
-    """The codes of answers; the letters are those of ``native/requests.h``."""
+    """Codes of answers, by the letters of ``native/requests.h``."""
 
     RESULT = ord("R")
     TROUBLE = ord("T")
@@ -68,7 +68,7 @@ class Answer(IntEnum):
 
 
 class DamagedError(Exception):
-    """A worker has sent what is no answer."""
+    """Error: a worker has sent bytes that are no answer."""
 
 
 class Reader:
@@ -146,7 +146,7 @@ class Answers:
 
     @property
     def count(self) -> int:
-        """How many instances there are."""
+        """Number of instances."""
         return int(self._block.stop - self._block.start)
 
     def result(self, code: int, reader: Reader, read: Callable[[Reader], Any]) -> Any:
@@ -222,7 +222,7 @@ def request_save(
 def request_restore(
     states: Sequence[bytes], indices: IndexArray, snapshot: int = NO_SNAPSHOT
 ) -> bytes:
-    """Restore states, or those of a snapshot."""
+    """Restore states, or a snapshot."""
     writer = Writer().array(indices, np.int64).integers(snapshot)
     for state in states:
         writer.block(state)

@@ -65,7 +65,7 @@ class RetryingPool(CountedPool):
     def _reset_once(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> int:
-        """Do what ``reset`` does, once; returns how many instances have trouble."""
+        """Reset once; return the number of troubled instances."""
 
     def _reset_patiently(
         self,

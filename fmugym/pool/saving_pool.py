@@ -41,7 +41,7 @@ def keeps_records(description: ModelDescription, spec: PoolSpec) -> bool:
 
 
 def offered_method(description: ModelDescription, spec: PoolSpec) -> SaveMethod:
-    """How states can be saved in this pool, as the FMU says.
+    """Method by which states can be saved in this pool, as the FMU says.
 
     Only where resets restore states is an FMU told in each step that it may be set back.
     """
@@ -62,7 +62,7 @@ class SavingPool(RetryingPool):
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
     def _prepare(self, fmu: FMU, spec: PoolSpec, log: logging.Logger) -> None:
-        """Keep what resets and saving need."""
+        """Keep the arguments of resets and of saving."""
         self._form = fmu.description, spec
         self._numbers: Iterator[int] = itertools.count(1)
         self._dropped: deque[int] = deque()

@@ -72,7 +72,7 @@ def is_start_time(variable: Variable) -> bool:
 
 
 class ResetMethod(StrEnum):
-    """How an instance starts a new episode, from the fastest method to the most reliable."""
+    """Method by which an instance starts an episode, from the fastest to the most reliable."""
 
     RESTORE = "restore"
     """Restore the FMU state after initialization if the start values are the same."""
@@ -92,7 +92,7 @@ REUSING: Final = (ResetMethod.RESTORE, ResetMethod.RESET)
 
 @dataclass(frozen=True)
 class PoolSpec:
-    """What a pool does at each reset and step.
+    """Work of a pool at each reset and step.
 
     Attributes:
         inputs: The variables set before each step, in the order of the rows of ``step``'s argument.
@@ -189,7 +189,7 @@ class PoolSpec:
 
     @property
     def whole_reset_method(self) -> ResetMethod:
-        """How a pool treats the FMU as a whole: components with methods of their own are reset."""
+        """Reset method of the FMU as a whole: components with methods of their own are reset."""
         return ResetMethod.RESET if self.component_resets else self.reset_method
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Execution of a pool of the engine: where and how its instances run, and why."""
+"""Execution of a pool: the processes and threads of its instances, with the reasons."""
 
 from __future__ import annotations
 
@@ -82,11 +82,11 @@ class Execution:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """How the pool runs, and why."""
+        """Sentences on the execution of the pool, with the reasons."""
         return self._summary, *(reason.text for reason in self.reasons)
 
     def log(self, logger: logging.Logger) -> None:
-        """Tell a logger how the pool runs, and why."""
+        """Tell a logger the execution of the pool, with the reasons."""
         logger.info("%s", self._summary)
         for text, level, once in self.reasons:
             is_known = once and (self.fmu.path, text) in _told
@@ -112,7 +112,7 @@ class Execution:
 
     @property
     def _separation(self) -> Iterator[str]:
-        """What keeps the instances from disturbing each other."""
+        """Measure that keeps the instances from disturbing each other."""
         each = "each " if self.num_instances > 1 else ""
         if self.own_files or self.spec.reset_method is ResetMethod.PROCESS:
             yield f"{each}with a copy of the FMU's files"
@@ -214,7 +214,7 @@ class Execution:
         return self
 
     def _with_limits_of_reading(self, verdict: Verdict) -> Execution:
-        """Tell what cannot be read, or not at any time."""
+        """Tell the variables that cannot be read, or not at any time."""
         execution, name = self, self.fmu.path.name
         if verdict.blind_start:
             execution = execution._because(

@@ -71,7 +71,7 @@ def with_harm(verdict: Verdict, fmu: FMU) -> Verdict:
 
 
 def state_files(fmu: FMU) -> str:
-    """Where states of an FMU are kept; see ``fmugym.pool.state_files``."""
+    """Folder of the states of an FMU; see ``fmugym.pool.state_files``."""
     try:
         return str(cache_folder("states") / content_key(fmu))
     except OSError:  # there is no folder for caches
@@ -79,7 +79,7 @@ def state_files(fmu: FMU) -> str:
 
 
 def known_resuming(fmu: FMU, spec: PoolSpec, starts: Any, length: int | None) -> SaveMethod | None:
-    """How states in the middle of an episode can be saved; None if that was not tried."""
+    """Method of saving states in the middle of an episode; None if that was not tried."""
     try:
         return SaveMethod(recall(_resuming_key(fmu, spec, starts, length)) or "")
     except ValueError:

@@ -151,7 +151,7 @@ def _verdict(
     num_instances: int,
     options: PoolOptions,
 ) -> Verdict:
-    """The verdict of a trial on what the options leave open, if the FMU is not exempt."""
+    """Verdict of a trial on options that are open, if the FMU is not exempt."""
     exempt = is_exempt(fmu)
     if fmu.bundled:
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
@@ -166,7 +166,7 @@ def _verdict(
 
 
 def _saving_method(execution: Execution, *task: Any) -> SaveMethod | None:
-    """How states can be saved; None if a trial shall find that out when one is first saved."""
+    """Method of saving states; None if a trial shall find it when one is first saved."""
     fmu, spec = execution.fmu, execution.spec
     offered = offered_method(fmu.description, spec)
     if fmu.bundled or offered is SaveMethod.REPLAY:

@@ -1,4 +1,4 @@
-"""Episodes of fresh instances, with which those of other instances are compared.
+"""Episodes of fresh instances, the reference for episodes of other instances.
 
 Each is played in a process of its own, with a fresh copy of the FMU's files. The inputs move,
 because that often is the only way to see that something is kept or shared.
@@ -188,7 +188,7 @@ class Reference:
             yield pool
 
     def step_once(self) -> None:
-        """Let a fresh instance do one step, and free it; it raises what ``find`` does."""
+        """Let a fresh instance do one step, and free it; errors are those of ``find``."""
         with self.open("the first step") as pool:
             self.play(pool, 0, 1)
 
@@ -235,7 +235,7 @@ class Reference:
         return self.runs[run.episode].cut(len(run.rows) - 1)
 
     def worst(self, runs: Sequence[Run]) -> Finding:
-        """Compare episodes with those of fresh instances; returns the worst finding."""
+        """Compare episodes with episodes of fresh instances; return the worst finding."""
         worst, before = Finding(Grade.BITWISE, ""), 0
         for number, run in enumerate(runs):
             grade = self._grade(run)
@@ -278,7 +278,7 @@ class Reference:
 
     @property
     def _steady(self) -> npt.NDArray[np.bool_]:
-        """Which outputs are not noisy; all if all are."""
+        """Mask of outputs without noise; all if all are noisy."""
         steady = np.array([v.name not in self.noisy for v in self.spec.outputs], np.bool_)
         return steady | (not steady.any())
 
@@ -312,7 +312,7 @@ class Reference:
         self._tolerances = np.maximum(self._tolerances, _SLACK * noise)
 
     def _play_afresh_in_one_process(self) -> list[Run]:
-        """Play episode 0 twice; what differs each time may depend on a process's age."""
+        """Play episode 0 twice; differing outputs may depend on a process's age."""
         reloads = self.workers.can_copy_libraries
         method = ResetMethod.LIBRARY if reloads else ResetMethod.INSTANCE
         with self.open("the search for noise", method) as pool:

@@ -1,4 +1,4 @@
-"""Steps of a trial: each plays with the instances of a pool, and returns what they gave.
+"""Steps of a trial: each plays with the instances of a pool, and returns their outputs.
 
 ``fmugym.trial.trial`` has their list, and opens the pools.
 """
@@ -67,7 +67,7 @@ def play_again_and_again(pool: TriedPool, reference: Reference) -> tuple[list[Ru
 
 
 def _episodes(reference: Reference) -> tuple[tuple[int, int], ...]:
-    """Which episodes to play, with their numbers of steps.
+    """Episodes to play, with their numbers of steps.
 
     After the longest ones come one that begins with a restored state, and one that begins with
     other start values; one has no step.
@@ -151,13 +151,13 @@ def _rows(pool: Pool, inputs: FloatArray) -> list[bytes]:
 
 
 def play_beside(pool: TriedPool, reference: Reference) -> list[list[Run]]:
-    """Play episodes with N instances that are stepped in turn; returns those of each."""
+    """Play episodes with N instances that are stepped in turn; return the episodes of each."""
     stretches = _beside(pool.num_instances, reference)
     return _read_again(pool, play(pool, reference.starts, reference.inputs, stretches))
 
 
 def play_alone(pool: TriedPool, reference: Reference, index: int, num_instances: int) -> list[Run]:
-    """Play with one instance what that at an index of N plays beside the others."""
+    """Play with one instance the episodes of an instance at an index of N."""
     stretches = [
         Stretch((begins[index],), steps) for begins, steps in _beside(num_instances, reference)
     ]
@@ -211,7 +211,7 @@ of its calls takes if steps are quick."""
 
 
 class Watched(NamedTuple):
-    """What the steps of an instance have shown.
+    """Findings of the steps of an instance.
 
     Attributes:
         written: The libraries to whose data they write, on Linux.
@@ -289,7 +289,7 @@ _FEW_ROUNDS: Final = 2
 
 @dataclass(frozen=True)
 class PairResult:
-    """What two instances gave in an episode, and how many initializations it took."""
+    """Outputs of two instances in an episode, and the number of initializations."""
 
     runs: tuple[Run, ...]
     initializations: int
@@ -308,7 +308,7 @@ class PairResult:
 
 
 def play_rounds(pool: TriedPool, reference: Reference) -> list[PairResult]:
-    """Play what rounds in threads are compared with: a first and a later episode.
+    """Play the reference of rounds in threads: a first and a later episode.
 
     Args:
         pool: Two instances, stepped by one thread.
@@ -340,7 +340,7 @@ def _rounds() -> Iterator[int]:
 
 
 def spec_for_threads(spec: PoolSpec, step_seconds: float, method: ResetMethod) -> PoolSpec:
-    """What instances do that are compared in threads: some are initialized while others step.
+    """Work of instances in threads: some are initialized while others step.
 
     Args:
         spec: What they do otherwise.
@@ -352,7 +352,7 @@ def spec_for_threads(spec: PoolSpec, step_seconds: float, method: ResetMethod) -
 
 
 def spec_to_watch(spec: PoolSpec, step_seconds: float) -> PoolSpec:
-    """What a lone instance does in ``watch_data``: little comes and goes between processes."""
+    """Work of a lone instance in ``watch_data``: little comes and goes between processes."""
     spec = spec_with_long_calls(spec, step_seconds, _WATCHED_SECONDS)
     return spec.beginning_by(ResetMethod.RESET)
 

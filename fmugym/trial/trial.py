@@ -87,7 +87,7 @@ def examine(
     length: int | None = None,
     must_survive: bool = True,
 ) -> Verdict:
-    """Find out in worker processes how to treat an FMU.
+    """Try an FMU in worker processes, and find the right treatment.
 
     Args:
         fmu: The FMU; this does not extract it.
@@ -216,7 +216,7 @@ class _Trial:
         self._reference = Reference(self.workers, spec, starts, length)
 
     def of_one(self, known: Verdict, *, must_survive: bool) -> Verdict:
-        """Find out what a lone instance shows, as far as that is not known."""
+        """Find unknown facts with a lone instance."""
         workers, name = self.workers, self._fmu.path.name
         workers.checks_heap &= not known.isolate
         try:
@@ -572,7 +572,7 @@ class _Trial:
     # 7. Saved states
 
     def of_saved_states(self) -> tuple[SaveMethod, Finding]:
-        """How states can be saved, and the finding of the last attempt.
+        """Method of saving states, and the finding of the last attempt.
 
         One process plays an episode, saves its state, plays on, restores the state and plays on
         again. A second process restores the same bytes in an instance that has never been
@@ -641,7 +641,7 @@ def _log(fmu: FMU, verdict: Verdict) -> None:
 
 @contextmanager
 def _naming(workers: Workers) -> Iterator[None]:
-    """Name the FMU and what the trial has used if an instance gets no licence."""
+    """Name the FMU and the licences of the trial if an instance gets none."""
     try:
         yield
     except LicenceError as error:

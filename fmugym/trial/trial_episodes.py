@@ -154,7 +154,7 @@ class Stretch(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """What an instance gave in an episode.
+    """Outputs of an instance in an episode.
 
     Attributes:
         episode: Which of the two.
@@ -191,7 +191,7 @@ class Run:
 
 
 class Limit(Protocol):
-    """What ends a stretch early."""
+    """Early end of a stretch."""
 
     def is_reached(self, steps: int) -> bool:
         """Whether it ends after so many steps; asked after each."""

@@ -20,7 +20,7 @@ MOST_INSTANCES: Final = 4
 
 
 class Grade(StrEnum):
-    """How well an episode after a reset matches the same episode of a fresh instance."""
+    """Grade of the match of an episode after a reset with the same of a fresh instance."""
 
     BITWISE = "bitwise"
     """All outputs are bit-identical."""
@@ -50,7 +50,7 @@ class Finding(NamedTuple):
 
 
 class Neighbours(StrEnum):
-    """What several instances need in order not to disturb each other."""
+    """Isolation that several instances need in order not to disturb each other."""
 
     INDEPENDENT = "independent"
     ONE_INITIALIZATION = "one initialization at a time"

@@ -48,7 +48,7 @@ _SILENT: Final = logging.Logger("fmugym.trial", logging.CRITICAL + 1)
 
 
 class DeathError(Exception):
-    """A process has not survived a call of the FMU; the text says how it ended.
+    """Error: a process has not survived a call of the FMU; the text describes its end.
 
     Args:
         call: What the FMU did.
@@ -142,7 +142,7 @@ class Workers:
     # Limits of time: at first long, then as it follows from the calls before.
 
     def limit(self, call: str) -> tuple[float, str]:
-        """How many seconds a call may take, and why."""
+        """Time-out of a call in seconds, and its reason."""
         timeout, factor = self.fmu.probe_timeout or DEFAULT_PROBE_TIMEOUT, _factor(call)
         longest = self._longest.get(_kind(call), math.inf)
         learnt = max(_LEAST, _EVENT * longest)
@@ -160,7 +160,7 @@ class Workers:
         self._longest[kind] = max(self._longest.get(kind, 0.0), seconds)
 
     def death(self, call: str, stage: str, loss: Loss) -> DeathError:
-        """Say how a process has ended."""
+        """Describe the end of a process."""
         how = loss.how.replace("ended with", "ended the process with", 1)
         if loss.is_late:
             seconds, why = self.limit(call)
@@ -188,7 +188,7 @@ class Workers:
             return failed(str(death))
 
     def note(self, death: DeathError, *, alone: bool = False) -> None:
-        """Note how a process has ended.
+        """Note the end of a process.
 
         Args:
             death: How.

@@ -317,7 +317,7 @@ def _stop(
     clock: Clock | None,
     close: Callable[[], None],
 ) -> None:
-    """Stop rigs, each after its current call, and close what they share."""
+    """Stop rigs, each after its current call, and close their shared parts."""
     calls = [(thread, Rig.stop, rig) for rig, thread in zip(rigs, threads, strict=True)]
     try:
         ask_all(calls, clock, _LONGEST_STOP)

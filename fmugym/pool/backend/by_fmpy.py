@@ -42,7 +42,7 @@ R = TypeVar("R")
 
 
 def _undisturbed(method: Callable[P, R]) -> Callable[P, R]:
-    """Let signals wait while an FMU works whose code is Python, which would get what they raise."""
+    """Let signals wait while an FMU of Python works, which would get their exceptions."""
 
     @functools.wraps(method)
     def call(*arguments: P.args, **named: P.kwargs) -> R:

@@ -1,4 +1,4 @@
-"""The time of what is not simulated step by step: real, faster than real, or moved by hand.
+"""Clocks of rigs: real time, faster than real time, or moved by hand.
 
 A lab, and whatever is paced, asks its clock what time it is and sleeps on it; nothing else tells it
 the time. With any but the default clock a program takes `clock.time` and `clock.sleep` in the place
@@ -24,7 +24,7 @@ end of a wait."""
 
 
 class Clock(Protocol):
-    """What is asked of a clock; both methods may be called from any thread."""
+    """Clock of a rig; both methods may be called from any thread."""
 
     def time(self) -> float:
         """Return the time, in s."""
@@ -36,7 +36,7 @@ class Clock(Protocol):
 
 
 def speed_of(clock: Clock | None) -> float:
-    """How many times as fast as real time a clock goes: 1, unless it has an attribute ``speed``."""
+    """Speed of a clock beside real time: 1, unless it has an attribute ``speed``."""
     speed: float = getattr(clock, "speed", 1.0)
     return speed
 
@@ -104,7 +104,7 @@ class ManualClock:
             self._changed.notify_all()
 
     def sleep(self, seconds: float) -> None:
-        """Wait for some time, in s; see the class for what moves the clock meanwhile.
+        """Wait for some time, in s; see the class for the movement of the clock.
 
         Raises:
             ConfigError: If the time is not a finite number.

@@ -58,7 +58,7 @@ class Messages:
         self._noted.append((status, category or b"", text or b""))
 
     def pass_on(self) -> None:
-        """Log what was noted, each message at the level of its status."""
+        """Log the noted messages, each at the level of its status."""
         while self._noted:
             status, category, text = self._noted.popleft()
             line = _readable(text)

@@ -1,4 +1,4 @@
-"""Steps in real time: how a user asks for them, and their schedule."""
+"""Steps in real time: their options and their schedule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One rig in the place of one FMU instance: what it needs to offer, and how it is called."""
+"""Rig in the place of one FMU instance: its methods, and the calls of them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Outputs = Mapping[str, float] | Sequence[float] | npt.NDArray[Any]
 
 
 class Backend(Protocol):
-    """What stands in for one FMU instance.
+    """Rig in the place of one FMU instance.
 
     A method that fails raises an exception. The step then fails like that of an FMU, with the
     exception's text as the reason, and no step follows before the next reset.
@@ -73,7 +73,7 @@ class Backend(Protocol):
 
 
 class FaultError(SimulationError):
-    """What a backend of an FMU raises: a fault with its status.
+    """Fault of a backend, with its status.
 
     Args:
         text: The reason.
@@ -207,5 +207,5 @@ def _pair(result: Any) -> tuple[Any, int]:
 
 
 def describe_error(error: Exception) -> str:
-    """Describe what a backend raised: its text, with the type where it is a foreign one."""
+    """Describe an exception of a backend: its text, with the type of a foreign one."""
     return f"{error}" if isinstance(error, SimulationError) else f"{type(error).__name__}: {error}"

@@ -24,7 +24,7 @@ _Orders = queue.SimpleQueue[_Order | None]
 
 
 class Idle(NamedTuple):
-    """What to do while there is no request.
+    """Work while there is no request.
 
     Attributes:
         action: Called whenever ``hold_after`` has passed without a request; it must not raise.

@@ -73,7 +73,7 @@ class Channel:
         self._poll = _listener(output, end.fileno(), sentinel)
 
     def send(self, code: int, content: bytes = b"", deadline: float = math.inf) -> None:
-        """Send a message; those of several threads do not mix.
+        """Send a message; messages of several threads do not mix.
 
         Args:
             code: The code.
@@ -209,7 +209,7 @@ def _listener(output: Output, *descriptors: int | None) -> Callable[[float | Non
 
 
 def _time_until(deadline: float) -> float:
-    """How many ms to wait at most.
+    """Longest wait in ms.
 
     Raises:
         LateError: If the time is over.

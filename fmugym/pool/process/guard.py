@@ -191,7 +191,7 @@ class _Guard:
             os._exit(status)
 
     def _let_go(self) -> None:
-        """Close what belongs to the guard, as a fork of it."""
+        """Close descriptors of the guard in a fork of it."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         self._requests.close()
@@ -279,7 +279,7 @@ def _become_program(order: Any, channel: int) -> NoReturn:
 
 
 def _kill_group(leader: int) -> None:
-    """Kill what is left of a worker's process group."""
+    """Kill the rest of a worker's process group."""
     with contextlib.suppress(ProcessLookupError, PermissionError):  # nothing is left
         os.killpg(leader, signal.SIGKILL)
 

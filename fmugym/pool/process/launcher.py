@@ -29,7 +29,7 @@ __all__ = ["Order", "Process", "launch"]
 
 @dataclass(frozen=True)
 class Order:
-    """What is to be started.
+    """Command to be started.
 
     Attributes:
         folder: Where the FMU was extracted to. It is removed if this process is killed.
@@ -59,7 +59,7 @@ class Order:
 
 
 def _import_path() -> list[str]:
-    """Where FMUs that run Python look for modules, from any working directory."""
+    """Folders in which FMUs of Python look for modules, from any working directory."""
     try:
         return [os.path.abspath(place) for place in sys.path]
     except OSError:  # the working directory has been removed
@@ -96,7 +96,7 @@ class Process(Protocol):
         ...
 
     def forget(self) -> None:
-        """Close what belongs to the process in this one, without ending it."""
+        """Close descriptors of the process in this one, without ending it."""
         ...
 
 

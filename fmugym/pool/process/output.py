@@ -71,7 +71,7 @@ class Output:
         self.writing_ends = []
 
     def pump(self) -> bool:
-        """Pass on what has come, but at most one chunk of each stream.
+        """Pass on received text, at most one chunk of each stream.
 
         Returns:
             Whether anything has come.
@@ -111,7 +111,7 @@ class Output:
         return [line.decode(errors="replace") for line in (*self._lines, *unfinished)]
 
     def clear(self) -> None:
-        """Forget what has been printed so far."""
+        """Forget the text printed so far."""
         if self._lines or any(self._unfinished.values()):
             self._lines.clear()
             self._unfinished = dict.fromkeys(_STREAMS, b"")
@@ -131,7 +131,7 @@ def _write(stream: int, data: bytes) -> None:
 
 
 def describe_exit(return_code: int) -> str:
-    """Say how a process ended.
+    """Describe the end of a process.
 
     Args:
         return_code: As ``subprocess`` and ``multiprocessing`` give it: minus the signal's number

@@ -141,7 +141,7 @@ class ProcessPool(AskingPool):
             return troubled
 
     def _reset_until_done(self, supervisors: list[Supervisor], *request: Any) -> int:
-        """Reset blocks, also in new workers; returns how many instances have trouble."""
+        """Reset blocks, also in new workers; return the number of troubled instances."""
         while supervisors:
             supervisors = self._reset(supervisors, *request)
         self._group.note_lost()
@@ -353,7 +353,7 @@ class ProcessPool(AskingPool):
 
     @property
     def initializations(self) -> int:
-        """How many initializations the workers have begun."""
+        """Number of initializations that the workers have begun."""
         return sum(supervisor.initializations for supervisor in self._group.supervisors)
 
     def processes(self) -> list[int]:

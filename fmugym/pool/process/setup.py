@@ -35,7 +35,7 @@ _WORKERS: Final = "of-workers"
 
 @dataclass(frozen=True)
 class Setup:
-    """What a worker needs to know.
+    """Set-up of a worker.
 
     Attributes:
         fmu: The FMU.
@@ -93,7 +93,7 @@ class Setup:
         private_libraries: bool = False,
         **options: Any,
     ) -> Setup:
-        """Extract an FMU, and say what a worker for all of its instances needs to know.
+        """Extract an FMU, and make the set-up of a worker for all of its instances.
 
         Args:
             fmu: The FMU.
@@ -138,7 +138,7 @@ class Setup:
         return self.own_files or self.spec.reset_method is ResetMethod.PROCESS
 
     def prepared(self) -> Setup:
-        """Make the files that a new process needs, in the place of those of an earlier one.
+        """Make files for a new process, in the place of the files of an earlier one.
 
         They are an empty working directory, the files of the FMU that are missing, and its own copy
         of them if it needs one.
@@ -181,7 +181,7 @@ class Setup:
                     Path(scratch, *first).symlink_to(Path(self.directory, *first))
 
     def order(self) -> Order:
-        """What to start."""
+        """Command of the worker."""
         if self.wine is None:
             environment, command = self.environment, []
         else:
@@ -191,7 +191,7 @@ class Setup:
         )
 
     def opening(self, memory: Memory) -> bytes:
-        """The first request: what to load, how to step it, and where the shared memory is."""
+        """First request: the files to load, the settings of steps, and the shared memory."""
         writer = Writer()
         writer.block(
             form_of_pool(
@@ -212,7 +212,7 @@ class Setup:
         return writer.form()
 
     def _files(self) -> Files:
-        """Where the worker finds the FMU, or the copies of libraries for its own instances."""
+        """Places of the FMU for the worker, or of copies of libraries for its own instances."""
         fmu, folder = self.fmu, self.files
         if fmu.in_wine:
             return Files.in_wine(fmu, folder)

@@ -44,7 +44,7 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
 
 
 class Memory:
-    """What a pool and one of its workers share, filled with zeros; no other worker can reach it.
+    """Memory that a pool and one worker share, zeros at first; no other worker can reach it.
 
     Args:
         spec: Names the inputs and outputs.
@@ -80,12 +80,12 @@ class Memory:
 
     @property
     def offsets(self) -> list[int]:
-        """Where the arrays begin, in the order of ``Arrays``, and then the echo and the bell."""
+        """Offsets of the arrays, in the order of ``Arrays``, and then of the echo and the bell."""
         return [*self._offsets, self._echo, self._bell]
 
     @property
     def echo(self) -> npt.NDArray[np.uint8]:
-        """Where the worker's FMUs leave their last words, a text that ends with a zero byte."""
+        """Memory of the last words of the worker's FMUs, a text that ends with a zero byte."""
         return np.ndarray(ECHO_SIZE, np.uint8, self.map, self._echo)
 
     @property
@@ -134,15 +134,15 @@ class BlockCopies:
         self._for_step = tuple(own[name] for name in read), tuple(blocks[name] for name in read)
 
     def give(self) -> None:
-        """Copy what the worker may read or change."""
+        """Copy the arrays that the worker may read or change."""
         self._copy(*self._pairs)
 
     def give_for_step(self) -> None:
-        """Copy what the worker reads in a step; it writes all the rest."""
+        """Copy the arrays that the worker reads in a step; it writes all others."""
         self._copy(*self._for_step)
 
     def take(self) -> None:
-        """Copy what the worker may have changed."""
+        """Copy the arrays that the worker may have changed."""
         shared, blocks = self._pairs
         self._copy(blocks, shared)
 

@@ -72,7 +72,7 @@ _STEPPED: Final = (Answer.RESULT, Answer.TROUBLE)
 
 
 def timeout_factor(doing: str) -> int:
-    """How many call time-outs something may take."""
+    """Number of call time-outs that something may take."""
     return INITIALIZATION_FACTOR if doing in _SLOW else 1
 
 
@@ -85,7 +85,7 @@ class RefusedError(LostError):
 
 
 class Loss(NamedTuple):
-    """How a process died or hung.
+    """Death or hang of a process.
 
     Attributes:
         how: What it did: ``"ended with signal SIGSEGV"``, for example.
@@ -197,7 +197,7 @@ class Supervisor:
             raise
 
     def confirm(self) -> None:
-        """Wait until the process is there, and tell it what to open.
+        """Wait for the process, and send it the request to open.
 
         Raises:
             LostError: If the system refuses.
@@ -374,7 +374,7 @@ class Supervisor:
         self._setup.lend(texts)
 
     def forget_output(self) -> None:
-        """Forget what was printed, because it would not explain a later failure."""
+        """Forget printed text, because it would not explain a later failure."""
         self._output.drain()
         self._output.clear()
 
@@ -433,7 +433,7 @@ class Supervisor:
         return True
 
     def _why_not_loaded(self, text: str) -> str:
-        """Say which libraries are missing, or else what the worker has said."""
+        """Name missing libraries, or else quote the worker."""
         try:
             if self._setup.wine is None:
                 self._setup.fmu.require_libraries(self._setup.folder)
@@ -532,7 +532,7 @@ class Supervisor:
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Turn what the system refuses into the loss of a worker."""
+    """Turn refusals of the system into the loss of a worker."""
     try:
         yield
     except FMULoadError as error:

@@ -35,7 +35,7 @@ _groups: weakref.WeakSet[WorkerGroup] = weakref.WeakSet()
 
 
 class WorkerGroup:
-    """The supervisors of a pool's workers, and what became of their instances.
+    """Supervisors of a pool's workers, and the fates of their instances.
 
     Args:
         fmu: The FMU; closed with the group.
@@ -111,7 +111,7 @@ class WorkerGroup:
 
     @property
     def losses(self) -> list[Loss]:
-        """How processes died or hung."""
+        """Deaths and hangs of processes."""
         return [loss for supervisor in self.supervisors for loss in supervisor.losses]
 
     def _deadline(self, doing: str) -> float:
@@ -175,7 +175,7 @@ class WorkerGroup:
         self.note_lost()
 
     def note_lost(self) -> None:
-        """Update what depends on ``lost``."""
+        """Update the values that depend on ``lost``."""
         self.any_lost = bool(self.lost.any())
         self.able = [s for s in self.supervisors if not self.lost[s.block].all()]
         self._arrays.statuses[self.lost] = Status.FATAL
