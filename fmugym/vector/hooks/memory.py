@@ -191,7 +191,7 @@ class StepArrays:
                 (_row(getattr(read, now), index), _row(getattr(read, name), index))
                 for name, now in PREVIOUS.items()
                 if name not in _KEPT_BY_THE_POOL
-                for index in range(max(1, getattr(read, name).size // self._n))
+                for index in range(getattr(read, name).size // self._n)
             ),
             "before_judgement": tuple(
                 pair for name in flat for pair in zip(flat[name], before[name], strict=True)
