@@ -132,7 +132,7 @@ class ResolvedTask:
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 
-    @property
+    @cached_property
     def future(self) -> Future:
         """Data and random numbers of later times, for hooks."""
         data = self._root.child("data").value or {}
