@@ -28,7 +28,6 @@ __all__ = [
     "is_function",
     "letter_of",
     "operation_of",
-    "run_program",
 ]
 
 _OF_EACH_TYPE: Final = (
@@ -193,35 +192,3 @@ class Program:
             self.results,
         )
         return form, tuple(map(find, self.rows))
-
-
-def run_program(
-    program: Program,
-    find: Callable[[Row], npt.NDArray[Any]],
-    actions: tuple[npt.NDArray[Any], npt.NDArray[Any]],
-    seen: tuple[npt.NDArray[Any], ...] = (),
-) -> list[npt.NDArray[Any]]:
-    """Run a program in C on M environments, outside of a step.
-
-    Args:
-        program: The program.
-        find: Returns the array of a row, shape (M,); the program may write to it.
-        actions: The actions and those before, environments first, shape (M, ...).
-        seen: The arrays to store observations in, environments first.
-
-    Returns:
-        The results: done, truncated and reward, or nothing; each of shape (M,).
-
-    Raises:
-        ConfigError: If there is no C extension.
-        IndexError: If an index is outside of its table.
-    """
-    count = len(actions[0])
-    types: tuple[Any, ...] = (np.bool_, np.bool_, np.float64)[: len(program.results)]
-    results: tuple[npt.NDArray[Any], ...] = tuple(np.zeros(count, t) for t in types)
-    first, second = (np.ascontiguousarray(part).reshape(-1) for part in actions)
-    elements = first.size // count
-    parts = program.with_rows(find)
-    if engine().evaluate(parts, count, elements, first, second, results, seen):
-        raise IndexError("a hook looks up an index outside of its table")
-    return list(results)
