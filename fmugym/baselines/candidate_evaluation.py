@@ -185,7 +185,7 @@ class CandidateEvaluator:
     def _options(self) -> dict[str, Any]:
         """Worker processes for an FMU that calls Python, which one process steps one by one."""
         with closing(self.make_env()) as env:
-            is_free = env.backend is None and env.isolation is None
+            is_free = env.given_backend is None and env.given_isolation is None
             apart = is_free and env.config.isolation is None and env.fmu.calls_python()
         return {"isolation": "process"} if apart and available_processors() > 1 else {}
 

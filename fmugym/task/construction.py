@@ -63,8 +63,8 @@ class Constructed(Pictured):
     Attributes:
         interface: The variables of the config, as the FMU has them.
         pool_spec: The work of the pool at each reset and step: step sizes, variables, solver.
-        backend: As it was given; None for a pool of the FMU.
-        isolation: As it was given; None for that of the config.
+        given_backend: The argument ``backend``; None for a pool of the FMU.
+        given_isolation: The argument ``isolation``; None for that of the config.
         pool: The pool that has the FMU.
         episode_start: The values with which episodes start, constant or drawn.
         formulas: The expressions of the task as values of a graph; None without expressions.
@@ -115,8 +115,8 @@ class Constructed(Pictured):
 
     # The FMU and its episode.
 
-    backend: Any
-    isolation: str | None
+    given_backend: Any
+    given_isolation: str | None
     _instance: Instance
     """While the pool is open."""
 
@@ -184,7 +184,7 @@ class Constructed(Pictured):
         """Open the pool, unless a vector environment is going to give one."""
         if isolation is not None:
             check_option("isolation", isolation, ISOLATIONS)
-        self.backend, self.isolation = backend, isolation
+        self.given_backend, self.given_isolation = backend, isolation
         if not pools_are_deferred():
             self._use(open_env_pool(self))
 
@@ -323,7 +323,7 @@ def require_construction(env: Constructed) -> None:
     Raises:
         ConfigError: If it has not.
     """
-    if "backend" not in vars(env):
+    if "given_backend" not in vars(env):
         name = type(env).__name__
         raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 

@@ -174,13 +174,13 @@ def pool_options(env: Any, *, max_episode_steps: int | None = None, **given: Any
     config = env.config
     limits = (max_episode_steps, config.max_episode_steps)
     own: dict[str, Any] = {
-        "isolation": env.isolation or config.isolation,
+        "isolation": env.given_isolation or config.isolation,
         "call_timeout": config.foreign.call_timeout,
         "reset_method": config.foreign.reset_method,
         "starts": env.episode_start.starts(),
         "max_episode_steps": min((one for one in limits if one is not None), default=None),
     }
-    backend = {} if env.backend is None else {"backend": env.backend}
+    backend = {} if env.given_backend is None else {"backend": env.given_backend}
     return PoolOptions(**(own | given | backend))
 
 

@@ -224,7 +224,7 @@ class Searching:
     def _is_fmu(self) -> bool:
         """Whether an FMU steps, and nothing in its place."""
         with closing(self.make_env()) as env:
-            return env.backend is None
+            return env.given_backend is None
 
     def _winner(self) -> ResidualAgent:
         """Search, and find the winner of the last validation.

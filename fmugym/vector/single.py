@@ -78,14 +78,14 @@ class ExpressionStep:
         self._updated = task.updated
         self._take_over(env, EpisodeColumn(rows, 0))
 
-    def _take_over(self, env: FMUEnv, readings: EpisodeColumn) -> None:
+    def _take_over(self, env: FMUEnv, column: EpisodeColumn) -> None:
         """Let the environment read its quantities from the arrays."""
         own = env._episode
         for name in READ:
-            setattr(readings, name, getattr(own, name))
-        readings.parameters = own.parameters
-        readings.variables.update(own.variables)
-        env._episode = readings
+            setattr(column, name, getattr(own, name))
+        column.parameters = own.parameters
+        column.variables.update(own.variables)
+        env._episode = column
 
     def step(self, env: FMUEnv, action: Any) -> Result:
         """Do a step.

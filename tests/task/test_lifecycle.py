@@ -370,3 +370,22 @@ def test_relative_paths_of_a_class_without_a_file(made, tmp_path, monkeypatch):
         "env.reset(); print(env.state); env.close()"
     )
     assert out == "(0.0,)\n"
+
+
+def test_own_attributes_do_not_steer_the_pool():
+    """They may have the names of arguments of the constructor."""
+
+    class Own(FMI2CSEnv):
+        def __init__(self):
+            config = {
+                "model_input_names": "f",
+                "model_output_names": "x",
+                "time_step": 0.02,
+                "terminated": False,
+            }
+            super().__init__(bundled_fmu("CartPole"), config)
+            self.backend, self.isolation = "my own", "mine"
+
+    envs = fmugym.FMUVectorEnv(Own, 2)
+    assert envs.reset(seed=0)[0].shape == (2, 1)
+    envs.close()
