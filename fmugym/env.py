@@ -27,12 +27,13 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
-from fmugym.task.beginning import FIRST, BeginningOfOne
+from fmugym.task.conclusion import conclude, first_observation
 from fmugym.task.construction import Constructed, draws_of_reset, prepare_hooks
 from fmugym.task.episode import Episode
+from fmugym.task.faults import Result
 from fmugym.task.interface import readable_named
-from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
+from fmugym.task.reset import FIRST, EpisodeReset
 from fmugym.task.saving import columns_of, place_columns, require_saving, scope_of
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.specs import EpisodeLimit, limit_of_make
@@ -204,10 +205,11 @@ class FMUEnv(Constructed):
         super().reset(seed=seed)
         generator = self._np_random
         rng = self.np_random if generator is None else generator
-        episode = draws.draw(rng, natively=pool.plays_alone)
+        values = draws.draw(rng, natively=pool.plays_alone)
         self._ended = True  # there is no episode if the FMU fails
         try:
-            BeginningOfOne(self, draws, episode).begin()
+            EpisodeReset(self, self._episode, draws, values).run()
+            self._pictured = None, 0.0
             self._was_reset, self._ended = True, False
             observation, info = first_observation(self)
             if not self._has_compiled:
@@ -216,7 +218,7 @@ class FMUEnv(Constructed):
             self._ended = True
             self._instance.halt()
             raise
-        info["drawn"] = episode.drawn
+        info["drawn"] = values.drawn
         if self.render_mode == "human":
             self.render()
         return observation, info
@@ -262,7 +264,7 @@ class FMUEnv(Constructed):
             try:
                 self._instance.step()
                 self._episode.step_count += 1
-                return judged(self, self._instance.pool.statuses.item(0))
+                return conclude(self, self._instance.pool.statuses.item(0))
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
                 self._ended = True
                 raise

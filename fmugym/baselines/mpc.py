@@ -34,6 +34,7 @@ from fmugym.task.future import Future, future_of
 from fmugym.task.saving import scope_of
 from fmugym.task.snapshot import Snapshot
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.candidates import tables_of
 
 __all__ = ["MPC"]
 
@@ -267,7 +268,7 @@ class MPC(Controller):
 
     def _decide_one(self, index: int, row: FloatArray) -> FloatArray:
         begin = perf_counter()
-        single = self._env.engine.single(index) if self._is_vector else nullcontext(self._env)
+        single = self._env.episodes.single(index) if self._is_vector else nullcontext(self._env)
         with single as env:
             future = future_of(env)
             now = 0.0 if future is None else float(future.clock(env))
@@ -278,7 +279,7 @@ class MPC(Controller):
                 self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
-        with self._copies.episodes.assuming(data):
+        with self._copies.task.assuming(tables_of(self._copies.prototype, data), None):
             best = self._search(episode, start, assumed, row)
         episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
         for name, paid in best.costs.items():
@@ -311,7 +312,7 @@ class MPC(Controller):
         future = future_of(env)
         keys = () if future is None else future.keys
         known = self._prototype.variables.keys() - keys
-        copied.engine.show(
+        copied.episodes.show(
             {n: float(v) for n, v in env.variables.items() if np.ndim(v) == 0 and n in known}, {}
         )
         episode.seen = np.asarray(observations, np.float64)

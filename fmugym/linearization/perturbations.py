@@ -16,6 +16,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.spec import START_TIME
 from fmugym.task.snapshot import Columns, Snapshot, stacked, taken
+from fmugym.vector.rollouts import returning_to
 from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["Matrices", "differentiate_by_starts"]
@@ -85,7 +86,7 @@ def differentiate_by_starts(
         SimulationError: See ``linearize_along``.
     """
     episodes = envs.episodes
-    with episodes.returning_to(envs.save_state() if episodes.is_ready else None):
+    with returning_to(episodes, envs.save_state() if episodes.is_ready else None):
         return _Perturbation(envs, states, start).differentiate(nominal, steps)
 
 
@@ -94,7 +95,7 @@ class _Perturbation:
 
     def __init__(self, envs: FMUVectorEnv, states: Mapping[str, str], start: Snapshot) -> None:
         env = envs.prototype
-        self._engine, self._pool, self._episodes = envs.engine, envs.pool, envs.episodes
+        self._task, self._pool, self._episodes = envs.task, envs.pool, envs.episodes
         self._spec = env.pool_spec
         self._space = float_box(envs.single_action_space, "action")
         self._x = tuple(map(env.fmu.variable, states))
@@ -157,13 +158,13 @@ class _Perturbation:
     def _follow(self, nominal: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Play the trajectory, and keep each moment of it; returns x and y."""
         count = len(self._everywhere)
-        self._episodes.place(self._start, np.zeros(count, np.int64))
+        self._episodes.go_on_from(self._start, np.zeros(count, np.int64))
         x, y = [self._pool.read(self._x)[:, 0]], []
         bundles, columns = [], []
         for index, action in enumerate(nominal):
             bundles.append(self._pool.save_instances(_FIRST))
-            columns.append(self._engine.columns(_FIRST))
-            result = self._engine.step(np.repeat(action[None], count, axis=0), None)
+            columns.append(self._episodes.columns(_FIRST))
+            result = self._task.step(np.repeat(action[None], count, axis=0))
             self._require_fine(f"step {index + 1}", _FIRST)
             if (result.terminated | result.truncated)[0] and index + 1 < len(nominal):
                 raise SimulationError(
@@ -232,8 +233,8 @@ class _Perturbation:
                 columns["outputs"][index] = self._pool.outputs[:, index].copy()
         before = self._pool.read(self._x).T
         self._require_states(before[starting], trials.states[starting])
-        self._engine.place(columns, self._everywhere, self._everywhere)
-        self._engine.step(trials.actions, None)
+        self._episodes.place(columns, self._everywhere, self._everywhere)
+        self._task.step(trials.actions)
         self._require_fine("a step", self._everywhere)
         outputs = self._pool.outputs[: self._count_of_y]
         return before, np.concatenate([self._pool.read(self._x), outputs]).T

@@ -29,6 +29,7 @@ from fmugym.task.actions import written_inputs
 from fmugym.task.episode import standing_in
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.starting import start_variable
+from fmugym.vector.rollouts import start_of_rollout
 from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["LinearTrajectory", "linearize_along"]
@@ -131,7 +132,7 @@ def linearize_along(
     env = envs.prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)
-    start = envs.episodes.start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
+    start = start_of_rollout(envs.episodes, checked_snapshot(snapshot, length=1), None, 1)
     chosen = _states(env, states)
     if method is not None:
         check_option("method", method, _METHODS)

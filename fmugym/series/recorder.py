@@ -225,7 +225,7 @@ class _Many:
         self.actions: Any = np.zeros(envs.action_space.shape, envs.action_space.dtype)
 
     def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
-        return self._envs.engine.evaluate(function, self.actions, indices)
+        return self._envs.episodes.evaluate(function, self.actions, indices)
 
     @property
     def pool(self) -> Pool:

@@ -14,7 +14,11 @@ import numpy.typing as npt
 from fmugym.errors import ConfigError
 from fmugym.expressions.quantities import KEPT, PREVIOUS, QUANTITIES
 from fmugym.pool.base import FloatArray
+from fmugym.pool.bundle import IndexArray
 from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
+
+if TYPE_CHECKING:
+    from fmugym.task.episode_start import EpisodeValues
 
 __all__ = [
     "READABLE",
@@ -80,31 +84,35 @@ class Episode:
             setattr(self, name, value)
         self.state = self.outputs[:width]
 
-    def begin(
-        self,
-        inputs: Sequence[float],
-        action: Any,
-        parameters: Mapping[str, Any],
-        variables: Mapping[str, Any],
+    def clear(
+        self, indices: IndexArray, inputs: Sequence[float], action: Any, values: EpisodeValues
     ) -> None:
-        """Begin the episode of a single environment; its outputs follow with ``look``.
-
-        Args:
-            inputs: The inputs before the first step.
-            action: What stands for the action of a step.
-            parameters: By name.
-            variables: By name.
-        """
-        self.inputs, self.action, self.parameters = tuple(inputs), action, parameters
+        """Begin the episode of a single environment; see ``fmugym.task.reset.ResetEpisodes``."""
+        self.inputs, self.action, self.parameters = tuple(inputs), action, values.parameters
         for name, zero in _NUMBERS:
             setattr(self, name, zero)
-        dict.update(self.variables, variables)
+        dict.update(self.variables, values.variables)
 
-    def look(self, outputs: FloatArray) -> None:
-        """Take the outputs and monitored variables of a single environment that has not stepped."""
-        self.outputs = tuple(outputs.tolist())
+    def look(self, indices: IndexArray, outputs: FloatArray) -> None:
+        """See ``ResetEpisodes.look``; of a single environment."""
+        self.outputs = tuple(outputs[:, 0].tolist())
         self.state = self.outputs[: self.width]
         self.keep()
+
+    def some(self, indices: IndexArray) -> Episode:
+        """See ``ResetEpisodes.some``; of a single environment."""
+        return self.mapped(_as_row)
+
+    def row(self, name: str) -> Any:
+        """See ``ResetEpisodes.row``; of a single environment."""
+        return _as_row(self.variables[name])
+
+    def warmed(self, indices: IndexArray, values: Mapping[str, Any], inputs: FloatArray) -> None:
+        """See ``ResetEpisodes.warmed``; of a single environment."""
+        for name, row in values.items():
+            part = row[..., 0]
+            self.variables[name] = part.item() if part.ndim == 0 else part
+        self.inputs = tuple(inputs[:, 0].tolist())
 
     def copy(self) -> Episode:
         """The same episode in an object of their own; the values are not copied."""
@@ -146,6 +154,10 @@ class Episode:
     def take_back(self, before: tuple[Any, ...]) -> None:
         """Return to before ``keep``: to the action and the inputs of then, too."""
         self.previous, self.action, self.inputs = before
+
+
+def _as_row(value: Any) -> Any:
+    return np.asarray(value)[..., np.newaxis]
 
 
 def _previous_value(place: int) -> Any:

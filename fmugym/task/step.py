@@ -14,7 +14,7 @@ from fmugym.task.results import as_flag, as_reward
 if TYPE_CHECKING:
     from fmugym.task.hooks import Hooks
 
-__all__ = ["NUMBERS", "ORDER", "Form", "Numbers", "conclude"]
+__all__ = ["NUMBERS", "ORDER", "Form", "Numbers", "call_hooks"]
 
 ORDER: Final = (
     "_get_inputs",
@@ -70,7 +70,9 @@ NUMBERS: Final = Numbers()
 """All single environments share it, so that it stays in the processor's caches."""
 
 
-def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) -> tuple[Any, ...]:
+def call_hooks(
+    env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any
+) -> tuple[Any, ...]:
     """Ask the hooks for the result of a step.
 
     Args:

@@ -23,7 +23,7 @@ from fmugym.task.spaces import to_input_types
 from fmugym.trial.known import state_files
 
 if TYPE_CHECKING:
-    from fmugym.task.beginning import Beginning
+    from fmugym.task.reset import EpisodeReset
 
 __all__ = ["WarmUp", "WarmUps"]
 
@@ -123,39 +123,41 @@ class WarmUps:
         self._keys: dict[int, bytes] = {}
         self._has_told = False
 
-    def begin(self, beginning: Beginning) -> None:
+    def begin(self, reset: EpisodeReset) -> None:
         """Bring new episodes to where their warm-ups lead; known states take the place of steps.
 
         Args:
-            beginning: The episodes; their pool then has the last inputs.
+            reset: The episodes; their pool then has the last inputs.
 
         Raises:
             SimulationError: If an FMU fails or refuses a state.
             ConfigError: If an input does not fit its type.
         """
-        pool, left = beginning.pool, beginning.indices.tolist()
+        pool, left = reset.pool, reset.indices.tolist()
         while left:
-            found = self._find(beginning, left)
+            found = self._find(reset, left)
             first = self._distinct(index for index in left if index not in found)
             if first:
                 where = np.array(first)
-                beginning.place(self._run(pool, beginning.start(where), where), where)
-            self._restore(beginning, found)
+                reset.episodes.warmed(
+                    where, self._run(pool, reset.start(where), where), pool.inputs
+                )
+            self._restore(reset, found)
             left = [index for index in left if index not in found and index not in first]
 
     # States that are known
 
-    def _find(self, beginning: Beginning, indices: Iterable[int]) -> Found:
+    def _find(self, reset: EpisodeReset, indices: Iterable[int]) -> Found:
         """Look for states that warm-ups of new episodes lead to."""
         self._keys = {}
-        if not self.warm_up.caches or not self._can_keep(beginning.pool):
+        if not self.warm_up.caches or not self._can_keep(reset.pool):
             return {}
-        variables = beginning.draws.model_variables
-        rows = [np.asarray(beginning.row(name)) for name in self.warm_up.depends_on]
+        variables = reset.draws.model_variables
+        rows = [np.asarray(reset.episodes.row(name)) for name in self.warm_up.depends_on]
         found = {}
         for index in indices:
             own = (np.float64(row[..., index]).tobytes() for row in rows)
-            starts = beginning.episode.start_values[:, index].tolist()
+            starts = reset.values.start_values[:, index].tolist()
             parts = [repr(values_by_name(variables, starts)).encode(), *own]
             key = self._key(parts)
             warmed = _memory.find(key) or self._read(key)
@@ -189,14 +191,15 @@ class WarmUps:
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
 
-    def _restore(self, beginning: Beginning, found: Found) -> None:
+    def _restore(self, reset: EpisodeReset, found: Found) -> None:
         """Bring FMUs to states that were found, each state once to all that begin with it."""
         groups: dict[bytes, list[int]] = {}
         for index, warmed in found.items():
             groups.setdefault(warmed, []).append(index)
         for warmed, indices in groups.items():
             where = np.array(indices)
-            beginning.place(self._restored(beginning.pool, warmed, where), where)
+            pool, values = reset.pool, self._restored(reset.pool, warmed, where)
+            reset.episodes.warmed(where, values, pool.inputs)
 
     def _restored(self, pool: Pool, warmed: bytes, indices: IndexArray) -> dict[str, Any]:
         inputs, *parts = np.split(np.frombuffer(warmed[: self._size]), self._ends[:-1])

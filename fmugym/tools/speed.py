@@ -122,7 +122,7 @@ def _of_vector(make_env: Callable[[], FMUEnv], size: int, seconds: float) -> Spe
         took = _fastest(lambda number: envs.step(actions[number % 16]), seconds)
         envs.reset(seed=0)
         share = _share(envs.prototype, seconds, took)
-        return Speed(size, envs.engine.way, size / took, took * 1e6, share)
+        return Speed(size, envs.task.way, size / took, took * 1e6, share)
 
 
 def _fastest(step: Callable[[int], Any], seconds: float) -> float:

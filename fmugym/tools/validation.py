@@ -688,4 +688,4 @@ def _hooks(make_env: Callable[[], FMUEnv]) -> str:
     except FMUGymError:
         return "none"
     envs.close()
-    return envs.engine.way
+    return envs.task.way

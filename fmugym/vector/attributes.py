@@ -15,8 +15,7 @@ from fmugym.task.construction import draws_of
 from fmugym.task.episode import READABLE
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.engines.engine import Engine
-from fmugym.vector.episodes import Episodes
+from fmugym.vector.tasks import Task
 
 __all__ = ["Attributes", "require_settable"]
 
@@ -57,13 +56,12 @@ class Attributes:
     """Attributes and methods of the environments, for ``get_attr``, ``set_attr`` and ``call``.
 
     Args:
-        prototype: The environment whose class and FMU all have.
-        engine: Keeps the values of each environment.
-        episodes: Tells whether there was one.
+        task: That of the environments, whose episodes keep the values.
     """
 
-    def __init__(self, prototype: FMUEnv, engine: Engine, episodes: Episodes) -> None:
-        self._prototype, self._engine, self._episodes = prototype, engine, episodes
+    def __init__(self, task: Task) -> None:
+        self._task, self._episodes = task, task.episodes
+        self._prototype = task.episodes.prototype
 
     def read(self, name: str, indices: Sequence[int]) -> list[Any]:
         """Read an attribute, or else a parameter, of some environments.
@@ -72,7 +70,7 @@ class Attributes:
             ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
         """
         name = check_text(_NAME, name)
-        return [self._engine.read(name, index) for index in indices]
+        return [self._episodes.read(name, index) for index in indices]
 
     def call(
         self, name: str, indices: Sequence[int], args: Sequence[Any], kwargs: Mapping[str, Any]
@@ -83,7 +81,7 @@ class Attributes:
             raise ConfigError(f"{name!r} cannot be called on single environments of many")
         if name == "render":
             return self.render(indices)
-        return self._engine.call(name, indices, args, kwargs)
+        return self._episodes.call(name, indices, args, kwargs)
 
     def render(self, indices: Sequence[int]) -> list[Any]:
         """Draw some environments; all have the same renderer.
@@ -97,7 +95,7 @@ class Attributes:
             raise SimulationError("render was called before the first reset")
         first, pictures = self._prototype, []
         for index in indices:
-            with self._engine.single(index) as env:
+            with self._episodes.single(index) as env:
                 env._renderer = env._renderer or first._renderer
                 pictures.append(env.render())
                 first._renderer = env._renderer
@@ -129,7 +127,7 @@ class Attributes:
 
     def _each(self, name: str, values: Any) -> list[Any]:
         """The values of all environments in their order."""
-        count = len(self._engine.ended)
+        count = len(self._episodes.ended)
         is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
         if not is_row and not issubclass(type(values), list | tuple):
             return [values] * count
@@ -159,7 +157,8 @@ class Attributes:
             for value in column.tolist():
                 self._prototype.interface.within(variable, value)
         for variable, column in columns.items():
-            self._engine.set_parameter(variable.name, column)
+            self._episodes.set_parameter(variable.name, column)
+        self._task.settle()
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute, or an episode variable, of some environments.
@@ -174,18 +173,18 @@ class Attributes:
         env, names = self._prototype, [*self._prototype.fmu.description.variables]
         if name in env.variables:
             drawn = name in env.episode_start.drawn_names
-            if drawn and len(values) < len(self._engine.ended):
+            if drawn and len(values) < len(self._episodes.ended):
                 raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
-            present = [self._engine.read(name, i) for i in range(len(self._engine.ended))]
+            present = [self._episodes.read(name, i) for i in range(len(self._episodes.ended))]
             each = [values.get(index, one) for index, one in enumerate(present)]
-            self._engine.set_variable(name, self._numbers(name, each))
+            self._episodes.set_variable(name, self._numbers(name, each))
             return
         names += env.variables
-        if self._engine.has_expressions_only:
+        if self._task.has_expressions_only:
             what = "parameter or episode variable, which is all that expressions read,"
             raise UnknownAttributeError(str(unknown_name(what, name, names)))
         if not hasattr(env, name):  # no hook can know of it: the name is misspelt
             names += [known for known in dir(env) if not known.startswith("_")]
             raise UnknownAttributeError(str(unknown_name("attribute or parameter", name, names)))
         require_settable(name)
-        self._engine.set_attribute(name, values)
+        self._episodes.set_attribute(name, values)

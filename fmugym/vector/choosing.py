@@ -1,4 +1,4 @@
-"""Choice of the engine that calls the hooks of N environments: programs, arrays, or one by one."""
+"""Choice of the task of N environments: expressions, hooks on arrays, or hooks one by one."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 from typing import Any, Final
 
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, warn_once
@@ -16,15 +15,15 @@ from fmugym.pool.extension import has_native_pool
 from fmugym.task.hooks import Hooks
 from fmugym.task.step import ORDER
 from fmugym.vector.action_arrays import is_array_space
-from fmugym.vector.engines.arrays import ArrayEngine
-from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.engine import Engine
-from fmugym.vector.engines.per_env import PerEnvEngine
+from fmugym.vector.array_hooks import ArrayHooks
+from fmugym.vector.each_hooks import EachHooks
+from fmugym.vector.expressions import Expressions
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.making import EnvMaker
+from fmugym.vector.tasks import Task
 
-__all__ = ["hook_of_one", "make_engine", "no_arrays", "require_own_order"]
+__all__ = ["hook_of_one", "make_task", "no_arrays", "require_own_order"]
 
 logger = logging.getLogger(__name__)
 
@@ -43,10 +42,10 @@ _KEYS: Final = {
 """The keys of the config whose expressions stand for hooks."""
 
 
-def make_engine(
+def make_task(
     maker: EnvMaker, prototype: FMUEnv, pool: Pool, max_episode_steps: int | None
-) -> Engine:
-    """Make the engine of N environments.
+) -> Task:
+    """Make the task of N environments.
 
     Expressions run as programs. Hooks that are vectorized are called once a step, on arrays; all
     others once for each environment, with a warning if there are many of these.
@@ -59,15 +58,14 @@ def make_engine(
     """
     reason = _reason(prototype)
     if reason is None:
-        task = _programs(prototype)
-        if task is None:
-            return ArrayEngine(prototype, pool.num_instances, max_episode_steps)
-        return BatchEngine(prototype, pool.num_instances, max_episode_steps, task)
+        programs = _programs(prototype)
+        if programs is None:
+            return ArrayHooks(prototype, max_episode_steps)
+        return Expressions(prototype, max_episode_steps, programs)
     if pool.num_instances >= _MANY:
         warn_once(logger, f"the hooks of {type(prototype).__name__} are called {reason}")
     envs = _make_all(maker, prototype, pool.num_instances)
-    space = batch_space(prototype.action_space, len(envs))
-    return PerEnvEngine(envs, pool, max_episode_steps, space)
+    return EachHooks(envs, pool, max_episode_steps)
 
 
 def require_own_order(env: FMUEnv) -> None:

@@ -1,58 +1,87 @@
-"""The episodes of a vector environment: saved, gone on from, and tried out in rollouts."""
+"""Episodes of N environments: their quantities, and the FMUs of their pool."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, SimulationError
+from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
+from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.saving import scope_of
-from fmugym.task.snapshot import Columns, Snapshot, checked_snapshot
-from fmugym.vector.engines.engine import Engine
-from fmugym.vector.rollouts import (
-    Candidates,
-    Rollout,
-    joined_rollouts,
-    roll_out_by_steps,
-    tables_of,
-)
+from fmugym.task.snapshot import Columns, Snapshot
+from fmugym.vector.arguments import UnknownAttributeError
 
-__all__ = ["Episodes"]
+__all__ = ["Episodes", "attribute"]
 
 
-class Episodes:
-    """The episodes that N environments are in, in their engine and in their pool.
+def attribute(env: FMUEnv, name: str) -> Any:
+    """Return an attribute of an environment, or else a variable or parameter of its episode.
+
+    Raises:
+        ConfigError: If there is none of this name (it is an ``AttributeError``, too).
+    """
+    if not hasattr(env, name):
+        for own in (env.variables, env.parameters):
+            if name in own:
+                return own[name]
+    try:
+        return getattr(env, name)
+    except AttributeError as error:
+        raise UnknownAttributeError(str(error)) from None
+
+
+class Episodes(ABC):
+    """Episodes of N environments.
 
     Args:
         prototype: The environment whose task all have.
-        engine: Has what hooks read.
-        pool: Has the FMUs.
+        pool: Their FMUs.
 
     Attributes:
+        prototype, pool: As given.
+        ended: Whether the last step ended the episode, shape (N,); always the same array.
+        any_ended: Whether the last step ended any episode.
         started: Whether there ever was one.
         is_ready: Whether a step may follow.
+        everywhere: The indices of all environments.
     """
 
-    def __init__(self, prototype: FMUEnv, engine: Engine, pool: Pool) -> None:
-        self._prototype, self._engine, self._pool = prototype, engine, pool
-        self._everywhere = np.arange(pool.num_instances)
+    def __init__(self, prototype: FMUEnv, pool: Pool) -> None:
+        self.prototype, self.pool = prototype, pool
+        self.ended, self.any_ended = np.zeros(pool.num_instances, np.bool_), False
         self.started = self.is_ready = False
+        self.everywhere = np.arange(pool.num_instances)
+
+    def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
+        """Note which episodes a step has ended."""
+        np.logical_or(terminated, truncated, out=self.ended)
+        self.any_ended = bool(np.count_nonzero(self.ended))
+
+    def note_starts(self, mask: MaskArray) -> None:
+        """Note which episodes have started."""
+        self.ended[mask] = False
+        self.any_ended = bool(np.count_nonzero(self.ended))
+
+    # Snapshots
 
     def save(self, indices: IndexArray) -> Snapshot:
         """Save the episodes of some environments.
 
         Raises:
+            ConfigError: If hooks have assigned to attributes of the class.
             SimulationError: If real systems stand in for the FMUs, or if an FMU fails.
         """
-        bundle = self._pool.save_instances(indices)
-        return Snapshot(scope_of(self._prototype), self._engine.columns(indices), bundle)
+        bundle = self.pool.save_instances(indices)
+        return Snapshot(scope_of(self.prototype), self.columns(indices), bundle)
 
     def columns_of(self, snapshot: Snapshot) -> Columns:
         """Columns of a snapshot.
@@ -60,9 +89,9 @@ class Episodes:
         Raises:
             ConfigError: If the snapshot is of another FMU or config.
         """
-        return snapshot.columns_for(scope_of(self._prototype))
+        return snapshot.columns_for(scope_of(self.prototype))
 
-    def place(self, snapshot: Snapshot, sources: IndexArray) -> None:
+    def go_on_from(self, snapshot: Snapshot, sources: IndexArray) -> None:
         """Let all environments go on from episodes of a snapshot that fits.
 
         Args:
@@ -72,8 +101,8 @@ class Episodes:
         Raises:
             SimulationError: If an FMU fails.
         """
-        self.restore(snapshot.bundle, sources, self._everywhere)
-        self._engine.place(self.columns_of(snapshot), sources, self._everywhere)
+        self.restore(snapshot.bundle, sources, self.everywhere)
+        self.place(self.columns_of(snapshot), sources, self.everywhere)
 
     def restore(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """Restore the FMUs of some environments; their quantities stay.
@@ -86,75 +115,107 @@ class Episodes:
         Raises:
             SimulationError: If an FMU fails.
         """
-        statuses = self._pool.restore_instances(bundle, sources, indices)
+        statuses = self.pool.restore_instances(bundle, sources, indices)
         for index in indices[statuses[indices] > WARNING_CODE].tolist():
-            raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+            raise SimulationError(f"environment {index}: {self.pool.failure(index)}")
 
-    @contextmanager
-    def returning_to(self, present: Snapshot | None) -> Iterator[None]:
-        """Return to the present episodes afterwards, or to none; nothing starts in between."""
-        engine = self._engine
-        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
-        try:
-            yield
-        finally:
-            engine.starts_at_ends = starts_at_ends
-            self.is_ready = False
-            if present is not None:
-                self.place(present, self._everywhere)
-                self.is_ready = True
+    @abstractmethod
+    def columns(self, indices: IndexArray) -> Columns:
+        """Copy the quantities and random streams of some episodes, without the FMUs' states."""
 
-    def assuming(self, data: Any) -> AbstractContextManager[None]:
-        """Let hooks read other data inside of a ``with`` block; see ``FMUVectorEnv.rollout``.
+    def require_fit(self, columns: Columns) -> None:
+        """Refuse columns that these environments cannot have.
 
         Raises:
-            ConfigError: If there is no such data, or the rows make no function of time.
+            ConfigError: If there are such columns.
         """
-        return self._engine.assuming(tables_of(self._prototype, data), None)
+        return
 
-    def start_of_rollout(
-        self, snapshot: Snapshot | None, present: Snapshot | None, count: int
-    ) -> Snapshot:
-        """Start of candidates: the snapshot that was given, or else the present episodes.
+    @abstractmethod
+    def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
+        """Let environments go on from columns; environment ``indices[i]`` from ``sources[i]``."""
+
+    # Single environments
+
+    @abstractmethod
+    def seed_of(self, index: int) -> int | None:
+        """Return the seed of an environment's generator."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the environments, but not the pool."""
+
+    @abstractmethod
+    def single(self, index: int) -> AbstractContextManager[FMUEnv]:
+        """Lend one environment as a single one, to read it and call its methods."""
+
+    def read(self, name: str, index: int) -> Any:
+        """Read an attribute, or else a parameter of the FMU, of one environment."""
+        with self.single(index) as env:
+            return attribute(env, name)
+
+    @abstractmethod
+    def call(
+        self,
+        name: str,
+        indices: Sequence[int],
+        arguments: Sequence[Any],
+        keywords: Mapping[str, Any],
+    ) -> list[Any]:
+        """Call a method of some environments; attributes that it assigns take effect.
 
         Raises:
-            ConfigError: If the snapshot does not fit, or not so many candidates.
-            SimulationError: If there is none, or an episode in it has ended.
+            ConfigError: If a method changes something that all environments must share. Then no
+                environment is changed.
         """
-        if snapshot is None and present is None:
-            raise SimulationError("rollout without a snapshot was called before the first reset")
-        start = checked_snapshot(present if snapshot is None else snapshot)
-        if len(start) not in ((count,) if snapshot is None else (1, count)):
-            raise ConfigError(
-                f"there are {count} candidates, but {len(start)} episodes where they may begin"
-            )
-        columns = self.columns_of(start)
-        self._engine.require_fit(columns)
-        if np.any(columns["ended"]):
-            raise SimulationError("an episode where candidates begin has ended: reset it first")
-        return start
 
-    def roll_out(self, start: Snapshot, candidates: Candidates) -> Rollout:
-        """Let the environments play all candidates, as many at a time as there are environments."""
-        with self._engine.assuming(candidates.tables, candidates.offsets):
-            parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
-        return joined_rollouts(parts, candidates.count)
+    @abstractmethod
+    def evaluate(
+        self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
+    ) -> FloatArray:
+        """Evaluate a function of the environment, which reads as hooks do and changes nothing.
 
-    def _roll_out(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
-        """Let each environment play the candidate at its place."""
-        engine, actions = self._engine, candidates.actions(places)
-        self._begin(start, places, candidates)
-        first = None if actions is not None else engine.observe(self._everywhere)
-        return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
+        Args:
+            function: Returns numbers for a single environment, and arrays of shape (M,) for a
+                prototype that stands for M of them.
+            actions: The latest actions of all environments, these first.
+            indices: The M environments to evaluate it for.
 
-    def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
-        """Bring all environments to the places where candidates begin."""
-        sources = places if len(start) > 1 else np.zeros_like(places)
-        self.restore(start.bundle, sources, self._everywhere)
-        columns = candidates.seen_in(self.columns_of(start))
-        self._engine.place(columns, sources, self._everywhere)
-        values = {name: column[places] for name, column in candidates.parameters.items()}
-        if values:
-            variables = tuple(map(self._prototype.fmu.variable, values))
-            self._pool.write(variables, np.stack(list(values.values())))
-        self._engine.show(candidates.variables, values)
+        Returns:
+            The values, shape (k, M).
+        """
+
+    @abstractmethod
+    def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """Set an attribute of some environments, by index.
+
+        Raises:
+            ConfigError: If these environments cannot have these values.
+        """
+
+    @abstractmethod
+    def set_variable(self, name: str, values: FloatArray) -> None:
+        """Give an episode variable one value for each environment, now and at each start.
+
+        Args:
+            name: The variable.
+            values: Environments last.
+        """
+
+    @abstractmethod
+    def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
+        """Give a parameter one value for each environment, from its next episode on.
+
+        Args:
+            name: The parameter.
+            values: Checked values: numbers, or the texts of a String as objects, shape (N,).
+        """
+
+    @abstractmethod
+    def show(self, variables: Mapping[str, float], parameters: Mapping[str, FloatArray]) -> None:
+        """Let hooks of all environments read other values in these episodes.
+
+        Args:
+            variables: Those of episode variables, by name.
+            parameters: Those of parameters, arrays of shape (N,) by name.
+        """

@@ -11,13 +11,15 @@ from fmugym.env import FMUEnv
 from fmugym.expressions.program import UncompilableError
 from fmugym.pool.extension import require_refusal
 from fmugym.task.actions import as_element
-from fmugym.task.judging import Result, judged
+from fmugym.task.conclusion import conclude
+from fmugym.task.faults import Result
 from fmugym.task.native_draws import no_draws
 from fmugym.task.saving import READ
-from fmugym.vector.engines.layout import Layout
+from fmugym.vector.episode_arrays import EpisodeArrays
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
-from fmugym.vector.hooks.memory import StepArrays
 from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.layout import Layout
+from fmugym.vector.step_form import prepare_step
 from fmugym.vector.views import EpisodeColumn, batched
 
 __all__ = ["ExpressionStep", "expression_step_of"]
@@ -63,11 +65,12 @@ class ExpressionStep:
         if task.inputs.loads("parameter") or task.judgement.loads("parameter"):
             numbers = zip(draws.parameter_names, starts, strict=True)
             rows.parameters = {name: row for name, row in numbers if name not in draws.strings}
-        self._memory = memory = StepArrays(env, rows, np.zeros(1, np.bool_))
-        memory.hold(task)
+        self._arrays = arrays = EpisodeArrays(env, rows, np.zeros(1, np.bool_))
+        arrays.hold(task.variables)
         shapes, form, self._divided = Layout(task, env, 1).of_one()
-        play = memory.prepare(
-            pool,
+        play = prepare_step(
+            env,
+            arrays,
             task,
             starts,
             (no_draws(), (), np.zeros((1, 6), np.uint64)),
@@ -103,7 +106,7 @@ class ExpressionStep:
         if troubled:
             return self._judge_again(env)
         if ended:
-            self._memory.ended[0] = False  # a reset begins the next episode, not the pool
+            self._arrays.ended[0] = False  # a reset begins the next episode, not the pool
         else:
             env._ended = False
         seen, reward, terminated, truncated, info = result
@@ -120,11 +123,11 @@ class ExpressionStep:
 
     def _judge_again(self, env: FMUEnv) -> Result:
         """Judge a step in Python, whose status or a number is not good, from before it on."""
-        memory, read, conversions = self._memory, env._episode, env._conversions
-        values, read.outputs = read.outputs, memory.kept[:, 0]
+        arrays, read, conversions = self._arrays, env._episode, env._conversions
+        values, read.outputs = read.outputs, arrays.kept[:, 0]
         for name in self._updated:
-            memory.variables[name][...] = memory.before[name]
-        read.done, memory.ended[0] = False, False
+            arrays.variables[name][...] = arrays.before[name]
+        read.done, arrays.ended[0] = False, False
         if not np.isfinite(env._instance.inputs).all():
             read.step_count -= 1
             conversions.input_writer.checked(
@@ -133,6 +136,6 @@ class ExpressionStep:
         if conversions.pool_observes:
             with np.errstate(over="ignore"):  # what is infinite then is a fault
                 env._instance.observation[:] = values[: env.interface.output_count]
-        result = judged(env, env._instance.pool.statuses.item(0), values)
+        result = conclude(env, env._instance.pool.statuses.item(0), values)
         env._ended = result[2] or result[3]
         return result

@@ -31,25 +31,22 @@ from fmugym.vector.arguments import (
     split_options,
 )
 from fmugym.vector.attributes import Attributes
-from fmugym.vector.choosing import make_engine, require_own_order
-from fmugym.vector.engines.engine import Engine, StepResult
-from fmugym.vector.episodes import Episodes
-from fmugym.vector.infos import final_infos, last_observations, merged, restricted
-from fmugym.vector.making import EnvMaker
-from fmugym.vector.overlap import Background, PendingStepError
-from fmugym.vector.rollouts import (
+from fmugym.vector.candidates import (
     Candidates,
-    Rollout,
     keys_of,
     offsets_of,
     tables_of,
     tunable_values,
 )
+from fmugym.vector.choosing import make_task, require_own_order
+from fmugym.vector.episodes import Episodes
+from fmugym.vector.making import EnvMaker
+from fmugym.vector.overlap import Background, PendingStepError
+from fmugym.vector.rollouts import Rollout, returning_to, roll_out, start_of_rollout
+from fmugym.vector.tasks import StepResult, Task
 from fmugym.vector.vector_saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv", "require_open"]
-
-_SAME_STEP = AutoresetMode.SAME_STEP  # each look-up takes time
 
 
 class FMUVectorEnv(VectorEnv[Any, Any, Any]):
@@ -81,8 +78,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: What follows the end of an episode; ``metadata`` has it, too.
         prototype: The first of the environments, whose task all have.
         pool: Has the FMUs.
-        engine: Has the quantities of the episodes, and calls the hooks.
-        episodes: Saves, restores and tries out episodes.
+        task: Surrounds the step of the FMUs by expressions or hooks.
+        episodes: Have the quantities that these read.
         attributes: Reads, sets and calls what single environments have.
         maker: Makes environments of the same class.
 
@@ -98,7 +95,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     prototype: FMUEnv
     pool: Pool
-    engine: Engine
+    task: Task
     episodes: Episodes
     attributes: Attributes
     maker: EnvMaker
@@ -168,12 +165,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(env.action_space, count)
         self.observation_space = batch_space(env.observation_space, count)
         self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
+        self._restarts = self.autoreset_mode is AutoresetMode.SAME_STEP
         self.closed = False  # which each step reads: faster here than in the class
         self._background = Background()
-        self.engine = make_engine(self.maker, env, self.pool, max_episode_steps)
-        self.episodes = Episodes(env, self.engine, self.pool)
-        self.attributes = Attributes(env, self.engine, self.episodes)
-        self.engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
+        self.task = make_task(self.maker, env, self.pool, max_episode_steps)
+        self.episodes, self.attributes = self.task.episodes, Attributes(self.task)
 
     # Episodes and steps.
 
@@ -203,7 +199,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             require_open(self, "reset")
         if seed is None and self.episodes.is_ready:
             try:
-                result = self.engine.reset_by(options)
+                result = self.task.reset_by(options)
             except BaseException:
                 self._interrupt()
                 raise
@@ -215,7 +211,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             raise ConfigError(f"the {when} must be of all environments")
         seeds = None if seed is None else checked_seeds(seed, self.num_envs)
         try:
-            observations, infos = self.engine.reset(mask, seeds, remaining)
+            observations, infos = self.task.reset(mask, seeds, remaining)
         except BaseException:
             self._interrupt()
             raise
@@ -261,7 +257,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._require_ready("step_around", ended=True)
         try:
-            return self.engine.step(actions, None, resting)
+            return self.task.step(actions, resting=resting)
         except BaseException:  # as in a single environment
             self._interrupt()
             raise
@@ -315,52 +311,37 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             if self.episodes.started:
                 when = "after an exception that has ended all episodes; call reset first"
             raise SimulationError(f"{method} was called {when}")
-        engine = self.engine
-        if not ended and engine.any_ended and self._waits:
-            index = int(np.flatnonzero(engine.ended)[0])
+        if not ended and self.episodes.any_ended and self._waits:
+            index = int(np.flatnonzero(self.episodes.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
     def _step(self, actions: Any, in_background: bool = False) -> StepResult:
-        engine = self.engine
-        any_ended = engine.any_ended
+        episodes, looks = self.episodes, self._at_ends
         is_busy = self._background.is_pending and not in_background
-        if not self.episodes.is_ready or self.closed or is_busy or (any_ended and self._waits):
+        if not episodes.is_ready or self.closed or is_busy or (episodes.any_ended and self._waits):
             self._require_ready("step")
         try:
-            result = engine.step(actions, engine.ended.copy() if any_ended else None)
-            if engine.any_ended and self.autoreset_mode is _SAME_STEP:
-                for look in self._at_ends:
+            result = self.task.step(actions, restart=self._restarts and not looks)
+            if looks and self._restarts and episodes.any_ended:
+                for look in looks:
                     look(actions)
-                return self._start_again(result, engine.ended.copy())
+                result = self.task.restarted(result)
+            return result
         except BaseException:  # as in a single environment
             self._interrupt()
             raise
-        return result
 
     def _interrupt(self) -> None:
         """After an exception, end the episodes whose FMUs have stepped without a result."""
         self.pool.halt()
-        if self.engine.has_moved:
+        if self.task.has_moved:
             self.episodes.is_ready = False
-
-    def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
-        """Start the next episodes in the step that ended some, where the engine has not."""
-        last = last_observations(self.single_observation_space, result.observations, ended)
-        engine = self.engine
-        started = engine.reset_by({"reset_mask": ended})
-        observations, infos = engine.reset(ended, None, {}) if started is None else started
-        told = result.infos
-        infos |= final_infos(last, restricted(told, ended), ended)
-        if told:
-            infos = merged(restricted(told, ~ended), infos)
-        return result._replace(observations=observations, infos=infos)
 
     def look_at_ends(self, look: Callable[[Any], None]) -> None:
         """Call a function of the actions where episodes have ended and the next have not begun.
 
         That moment is within a step in the mode ``SAME_STEP``.
         """
-        self.engine.starts_at_ends = False
         self._at_ends = (*self._at_ends, look)
 
     def render(self) -> tuple[Any, ...] | None:
@@ -417,13 +398,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         columns = self.episodes.columns_of(snapshot)
         if not self.episodes.is_ready and len(indices) < self.num_envs:
             raise ConfigError("before a reset of all, a snapshot must be restored in all")
-        self.engine.require_fit(columns)
+        self.episodes.require_fit(columns)
         require_saving(self.pool)
         self.episodes.is_ready = False
         self.episodes.restore(snapshot.bundle, sources, indices)
-        self.engine.place(columns, sources, indices)
+        self.episodes.place(columns, sources, indices)
         self.episodes.started = self.episodes.is_ready = True
-        return self.engine.observe(indices)
+        return self.task.observe(indices)
 
     def rollout(
         self,
@@ -474,9 +455,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         candidates.offsets = offsets_of(prototype, offsets)
         candidates.variables = keys_of(prototype, seed)
         present = self.save_state() if self.episodes.is_ready else None
-        start = self.episodes.start_of_rollout(snapshot, present, candidates.count)
-        with self.episodes.returning_to(present):
-            return self.episodes.roll_out(start, candidates)
+        start = start_of_rollout(self.episodes, snapshot, present, count)
+        with returning_to(self.episodes, present):
+            return roll_out(self.task, start, candidates)
 
     # Single environments.
 
@@ -520,7 +501,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
-        return tuple(self.engine.seed_of(index) for index in range(self.num_envs))
+        return tuple(self.episodes.seed_of(index) for index in range(self.num_envs))
 
     @property
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
@@ -547,10 +528,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool, after waiting for a step that is under way."""
-        if "engine" in vars(self):  # otherwise the constructor has closed everything
+        if "task" in vars(self):  # otherwise the constructor has closed everything
             self._background.stop()
             try:
-                self.engine.close()
+                self.episodes.close()
             finally:
                 self.pool.close()
 

@@ -13,7 +13,9 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.expressions.quantities import KEPT, PREVIOUS
 from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.bundle import IndexArray
 from fmugym.task.episode import Episode
+from fmugym.task.episode_start import EpisodeValues
 from fmugym.task.values import EpisodeVariables, ParameterValues
 
 __all__ = ["EpisodeColumn", "batched", "keep_rows", "some", "start_numbers", "take"]
@@ -149,24 +151,20 @@ class EpisodeColumn(Episode):
         """The episode variables by name."""
         return _ColumnVariables(self.batch.variables, self.index)
 
-    def begin(
-        self,
-        inputs: Sequence[float],
-        action: Any,
-        parameters: Mapping[str, Any],
-        variables: Mapping[str, Any],
+    def clear(
+        self, indices: IndexArray, inputs: Sequence[float], action: Any, values: EpisodeValues
     ) -> None:
-        """See ``Episode.begin``."""
+        """See ``Episode.clear``."""
         batch, index = self.batch, self.index
         batch.inputs[:, index] = inputs
         batch.action[..., index] = action
         start_numbers(batch, index)
-        self.parameters = parameters
-        for name, value in variables.items():
+        self.parameters = values.parameters
+        for name, value in values.variables.items():
             row = batch.variables[name]
             row[index if row.ndim == 1 else (..., index)] = value
 
-    def look(self, outputs: FloatArray) -> None:
+    def look(self, indices: IndexArray, outputs: FloatArray) -> None:
         """See ``Episode.look``; the arrays have the outputs already."""
         keep_rows(self.batch, self.index)
 

@@ -82,7 +82,7 @@ class TestExamples:
         config = str(EXAMPLES / f"{name}.toml")
         options = {"num_envs": 5, "autoreset_mode": mode}
         envs = gymnasium.make_vec("fmugym/FMU-v0", config=config, **options)
-        assert envs.unwrapped.engine.way == "expressions"
+        assert envs.unwrapped.task.way == "expressions"
         twins = gymnasium.make_vec(TWINS[name][0], **options)
         envs.action_space.seed(0)
         same(envs.reset(seed=7), twins.reset(seed=7))

@@ -117,7 +117,7 @@ class TestLimits:
 def test_many_environments_are_compiled_and_equal_single_ones(kind):
     make = partial(fmugym.load, formed(TASKS[kind], **FORMS["both"]), physical=True)
     envs = FMUVectorEnv(in_way("expressions", make), 2)
-    assert envs.engine.way == "expressions"
+    assert envs.task.way == "expressions"
     controller = CONTROLLERS["pid"]().bind(envs)
     observations, _ = envs.reset(seed=[3, 4])
     rewards = []

@@ -126,7 +126,7 @@ def test_inputs_of_the_step_before_in_many(way, mode, make_envs):
     envs.action_space.seed(1)
     before, ends = np.zeros(3), 0
     for step in range(40):
-        fresh = envs.engine.ended.copy()
+        fresh = envs.episodes.ended.copy()
         if mode is gymnasium.vector.AutoresetMode.DISABLED and fresh.any():
             envs.reset(options={"reset_mask": fresh})
             before[fresh], fresh[:] = 0.0, False

@@ -39,7 +39,7 @@ from fmugym.training import searching, twin
 from fmugym.training.searching import Searching
 from fmugym.training.twin import TwinSearch
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.expressions import Expressions
 
 AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
 STRETCH = 10.0 ** np.linspace(0, 2, 6)  # lengths of axes, so that variances differ by 1e4
@@ -1245,19 +1245,19 @@ class Budget:
 
     def __init__(self, monkeypatch):
         self.steps, self.is_open = 0, True
-        step, judge = BatchEngine.step, searching.judge
+        step, judge = Expressions.step, searching.judge
 
-        def counted(engine, actions, resetting, resting=None):
+        def counted(task, actions, *, restart=False, resting=None):
             idle = 0 if resting is None else np.count_nonzero(resting)
-            is_fmu = not isinstance(engine._pool, SurrogatePool)
+            is_fmu = not isinstance(task.episodes.pool, SurrogatePool)
             self.steps += (len(actions) - idle) * self.is_open * is_fmu
-            return step(engine, actions, resetting, resting)
+            return step(task, actions, restart=restart, resting=resting)
 
         def judged(*arguments):
             self.is_open = False
             return judge(*arguments)
 
-        monkeypatch.setattr(BatchEngine, "step", counted)
+        monkeypatch.setattr(Expressions, "step", counted)
         monkeypatch.setattr(searching, "judge", judged)
         monkeypatch.setattr(searching, "monotonic", lambda: 1e-4 * self.steps)
         monkeypatch.setattr(Probe, "round_time", lambda *_: 0.0)

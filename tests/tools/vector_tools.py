@@ -14,7 +14,7 @@ import fmugym
 from fmugym import Uniform
 from fmugym.linearization import linearize_along
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.array_episodes import ArrayEpisodes
 from fmugym.vector.infos import observation_of
 
 IDS = (
@@ -168,7 +168,7 @@ def require_same_alone(make, steps, mode="next_step", method=None, way=None, **o
     """
     mode = AutoresetMode[mode.upper()]
     ours = FMUVectorEnv(in_way(way, make), 3, autoreset_mode=mode, **options)
-    assert way in (None, ours.engine.way)
+    assert way in (None, ours.task.way)
     theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
     return run_side_by_side(ours, theirs, steps, method)
 
@@ -362,13 +362,13 @@ class Shifted(Drawing):
 def fixture_outside(monkeypatch):
     """The episodes that Python has started, and not the pass of the native pool."""
     calls = []
-    begin = BatchEngine._begin
+    begin = ArrayEpisodes.begin
 
     def counted(self, *args):
         calls.append(args)
         return begin(self, *args)
 
-    monkeypatch.setattr(BatchEngine, "_begin", counted)
+    monkeypatch.setattr(ArrayEpisodes, "begin", counted)
     return calls
 
 

@@ -67,7 +67,7 @@ def test_a_task_that_is_too_long_for_a_program_runs_on_arrays(make_envs, caplog)
     number = np.arange(3, 3500)
     expected = [(np.sin(one[0] * number) + number).sum() for one in envs.get_attr("state")]
     assert rewards == pytest.approx(expected)
-    assert envs.engine.way == "arrays"
+    assert envs.task.way == "arrays"
 
 
 @test_declared.each_file

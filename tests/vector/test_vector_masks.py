@@ -15,7 +15,7 @@ from vector_tools import CART_POLE, Drawing, PushedCart, require_equal, require_
 from ways import in_way
 
 from fmugym import SimulationError, Uniform
-from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.expressions import Expressions
 
 
 class Pictured(Drawing):
@@ -121,7 +121,7 @@ def test_one_call_of_the_pool_does_it(task, monkeypatch, made):
     def refuse(*_):
         raise AssertionError("the general way")
 
-    monkeypatch.setattr(BatchEngine, "reset", refuse)
+    monkeypatch.setattr(Expressions, "reset", refuse)
     for mask in np.eye(5, dtype=np.bool_):
         envs.reset(options={"reset_mask": mask})
     monkeypatch.undo()
@@ -245,11 +245,11 @@ def test_a_first_observation_that_is_not_finite_in_the_step_that_ends_another_ep
 
 def test_references_do_not_leak(made):
     envs, mask = made(CART_POLE), np.array([True, False, False, True, False])
-    engine, options = envs.engine, {"reset_mask": mask}
+    options = {"reset_mask": mask}
     watched = (
         mask,
         options,
-        engine.env.episode_start,
+        envs.prototype.episode_start,
         CART_POLE,
         None,
         True,

@@ -204,8 +204,8 @@ def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments(make_
     envs.reset(seed=0)
     actions = np.zeros((2, 1), np.float32)
     envs.step(actions)
-    envs.engine.ended[:] = [False, True]
-    envs.engine.any_ended = True
+    envs.episodes.ended[:] = [False, True]
+    envs.episodes.any_ended = True
     infos = envs.step(actions)[-1]
     assert infos["part"].tolist() == [1.0, 0.0]
     assert infos["part"].dtype == np.float64

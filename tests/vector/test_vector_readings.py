@@ -108,7 +108,7 @@ def test_a_recorded_series_tells_the_state_before(hooks, pair):
     envs = ours, theirs = pair(hooks)
     actions = sampled_actions(ours, 1)
     list(results_of_both(*envs, actions))
-    told = ours.engine.evaluate(
+    told = ours.episodes.evaluate(
         lambda env: [env.previous_state[0], env.previous_action[0]], *actions, np.arange(COUNT)
     )
     for row, one in zip(told.T, theirs.call("told"), strict=True):

@@ -214,5 +214,5 @@ def require_refused(results, monkeypatch, *, refused=True):
 
     monkeypatch.setattr(envs.pool, "prepare_play", with_others)
     with pytest.raises((TypeError, ValueError)) if refused else contextlib.nullcontext():
-        envs.engine._prepare(envs.engine._task)
+        envs.task.settle()
     envs.close()

@@ -159,7 +159,7 @@ def test_the_pool_starts_episodes(cls, mode, monkeypatch, make_envs):
     ours, theirs = (
         make_envs(in_way(way, cls), 20, autoreset_mode=mode) for way in ("arrays", "one by one")
     )
-    monkeypatch.setattr(ours.engine, "_begin", None)
+    monkeypatch.setattr(ours.episodes, "begin", None)
     ended = np.zeros(20, np.bool_)
     for result in results_of_both(ours, theirs, 25, rtol=ROUNDED, same=require_close):
         ended |= result[2] | result[3]

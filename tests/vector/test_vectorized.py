@@ -87,7 +87,7 @@ WAYS = [
 @pytest.mark.parametrize(("make", "way"), WAYS)
 def test_it_holds_for_the_hooks_of_the_class_body_that_says_it(make, way, make_envs):
     envs = make_envs(make, 3)
-    assert envs.engine.way == way
+    assert envs.task.way == way
     envs.reset(seed=1)
     envs.step(NOTHING)
 
@@ -98,7 +98,7 @@ def test_nothing_is_called_at_construction(make, way, make_envs, monkeypatch):
         raise AssertionError("a hook was called")
 
     monkeypatch.setattr(make, "_reward_policy", refuse, raising=False)
-    assert make_envs(make, 3).engine.way in (way, "one by one")
+    assert make_envs(make, 3).task.way in (way, "one by one")
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ class Parts(Declared):
 @pytest.mark.usefixtures("unwarned")
 def test_spaces_that_make_no_arrays_are_called_one_by_one_with_a_reason(make_envs, caplog):
     envs = make_envs(Parts, 16)
-    assert envs.engine.way == "one by one"
+    assert envs.task.way == "one by one"
     assert "actions of Tuple(Discrete(2)) do not make one array" in caplog.text
 
 

@@ -480,7 +480,7 @@ def test_hooks_of_several_real_plants(hooks, mode):
     ours = FMUVectorEnv(
         in_way(hooks, lambda: RigEnv(made_at_once, **config)), 3, autoreset_mode=mode
     )
-    assert ours.engine.way == hooks
+    assert ours.task.way == hooks
     theirs = SyncVectorEnv([lambda: RigEnv(Oscillator(), **config)] * 3, autoreset_mode=mode)
     assert run_side_by_side(ours, theirs, 40) > 9
 

@@ -1,4 +1,4 @@
-"""N environments whose hooks are called once a step, on arrays."""
+"""Task of hooks that are called once a step, on the arrays of N environments."""
 
 from __future__ import annotations
 
@@ -14,77 +14,69 @@ from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray, Played
 from fmugym.task.episode import environments_last
 from fmugym.task.hooks import Hooks
-from fmugym.task.step import ORDER, conclude
-from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.engine import StepResult, failed_in
+from fmugym.task.step import ORDER, call_hooks
+from fmugym.vector import faults
+from fmugym.vector.expressions import Expressions
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.tasks import StepResult, failed_in
 
-__all__ = ["ArrayEngine"]
+__all__ = ["ArrayHooks"]
 
 _ON_ARRAYS: Final = (*ORDER, "_goal_reward")
 """The hooks that are called on arrays."""
 
 
-class ArrayEngine(BatchEngine):
-    """A batch whose hooks are called on arrays, before the step of the FMUs and after it.
+class ArrayHooks(Expressions):
+    """Task of hooks on arrays, called before the step of the FMUs and after it.
 
     Args:
-        env, num_envs, max_episode_steps: See ``BatchEngine``.
+        env, max_episode_steps: See ``Expressions``.
     """
 
     way = "arrays"
 
-    def __init__(self, env: FMUEnv, num_envs: int, max_episode_steps: int | None) -> None:
+    def __init__(self, env: FMUEnv, max_episode_steps: int | None) -> None:
         self._idle: MaskArray | None = None
         self._busy: MaskArray | None = None
-        self._all = np.ones(num_envs, np.bool_)
-        super().__init__(
-            env,
-            num_envs,
-            max_episode_steps,
-            TaskPrograms.without_programs(env.variables, len(env.interface.inputs)),
-        )
+        self._all = np.ones(env._instance.pool.num_instances, np.bool_)
+        programs = TaskPrograms.without_programs(env.variables, len(env.interface.inputs))
+        super().__init__(env, max_episode_steps, programs)
 
-    def _prepare(self, task: TaskPrograms) -> None:
-        super()._prepare(task)
+    def _prepare(self, programs: TaskPrograms) -> None:
+        super()._prepare(programs)
         self._are_hooks_tried = False
 
-    def _settle_starts(self) -> None:
-        """See ``BatchEngine._settle_starts``; hooks tell which episodes end."""
-        super()._settle_starts()
-        self._starts_at_ends = False
+    # Episodes
 
-    # The beginning of episodes.
-
-    def _begun(
+    def _first_by_pool(
         self, observations: Any, infos: dict[str, Any], troubled: int
     ) -> tuple[Any, dict[str, Any]]:
-        """See ``BatchEngine._begun``."""
+        """See ``Expressions._first_by_pool``."""
         self.has_moved = True
         made = observations if self.env._conversions.pool_observes else None
-        observations, more = self._seen_at_start(made, infos["_drawn"])
+        observations, more = self._first(made, infos["_drawn"])
         return observations, more | infos
 
-    def _seen_at_start(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
-        """See ``BatchEngine._seen_at_start``."""
+    def _first(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
+        """See ``Expressions._first``."""
         try:
-            return super()._seen_at_start(observations, mask)
+            return super()._first(observations, mask)
         except Exception as error:
             self._blame_arrays(error)
             raise
 
-    # A step.
+    # Steps
 
-    def _play_step(self, actions: Any, resetting: MaskArray | None) -> Played:
-        """See ``BatchEngine._play_step``."""
-        taken, step = self._checked(actions, resetting), cast(Any, self._play.step)
+    def _play_step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> Played:
+        """See ``Expressions._play_step``; hooks tell which episodes end, so that none restarts."""
+        taken, step = self._checked(actions, fresh), cast(Any, self._play.step)
         self.has_moved = True
         played: Played = step(taken, False)
         return played
 
     def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
-        """See ``BatchEngine._checked``; the hook makes the inputs.
+        """See ``Expressions._checked``; the hook makes the inputs.
 
         If the hook fails, nothing has changed.
         """
@@ -92,7 +84,7 @@ class ArrayEngine(BatchEngine):
         read = self.env._episode
         before, read.action = read.keep(), environments_last(taken)
         try:
-            self._write_inputs(self._memory.given, idle)
+            self._write_inputs(self.episodes.arrays.given, idle)
             self._keep_variables()
             return taken
         except Exception as error:
@@ -102,7 +94,7 @@ class ArrayEngine(BatchEngine):
             read.take_back(before)  # the pool does the same with its arrays
 
     def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
-        """See ``BatchEngine._completed``; the hooks that follow the FMUs' step are called."""
+        """See ``Expressions._completed``; the hooks that follow the FMUs' step are called."""
         env, conversions = self.env, self.env._conversions
         result, troubled, _, started = played
         started = idle if started is None else started
@@ -114,14 +106,14 @@ class ArrayEngine(BatchEngine):
         observed = result.observations if conversions.pool_observes else None
         try:
             stopped = result.terminated if troubled else False
-            seen, rewards, terminated, truncated = conclude(
+            seen, rewards, terminated, truncated = call_hooks(
                 env, self, stopped, result.truncated, observed
             )
             if observed is None:
                 seen = hook_results.observations(seen, env.observation_space, self._n)
             infos = result.infos
             if conversions.has_info:
-                infos = self._infos(self._all) | infos
+                infos = self.infos(self._all) | infos
             self._keep_variables()
             self._are_hooks_tried = True
         except Exception as error:
@@ -132,10 +124,10 @@ class ArrayEngine(BatchEngine):
             terminated &= running
             truncated &= running
             np.copyto(rewards, 0.0, where=started)
-        self._memory.keep_done(terminated)
-        self.note_ends(terminated, truncated)
+        self.episodes.arrays.keep_done(terminated)
+        self.episodes.note_ends(terminated, truncated)
         result = StepResult(seen, rewards, terminated, truncated, infos)
-        self._settle(result, troubled, started)
+        faults.settle(self, result, troubled, started)
         return result
 
     def _blame_arrays(self, error: Exception) -> None:
@@ -180,11 +172,11 @@ class ArrayEngine(BatchEngine):
         env._update()
         self._keep_variables()
         if self._idle is not None and self._idle.any():
-            self._restore_variables(self._idle)
+            self.episodes.restore_variables(self._idle)
 
     def _keep_variables(self) -> None:
         """Copy assigned variables to the arrays that the pool keeps, or make others."""
-        variables, held = self.env.variables, self._memory.variables
+        variables, held = self.env.variables, self.episodes.arrays.variables
         if not held:
             return
         assigned = [name for name, row in held.items() if variables[name] is not row]
@@ -200,16 +192,16 @@ class ArrayEngine(BatchEngine):
             else:
                 variables[name], others[name] = value, value.dtype
         if others:
-            before = dict(self._memory.before)
-            self._prepare(replace(self._task, variables={**self._task.variables, **others}))
-            self._memory.take_back(before)
+            before = dict(self.episodes.arrays.before)
+            self._prepare(replace(self._programs, variables={**self._programs.variables, **others}))
+            self.episodes.arrays.take_back(before)
 
     def _value_of(self, name: str, value: Any, count: int) -> npt.NDArray[Any]:
         """A value of a variable in the type that it is kept in.
 
         If more than one are assigned, it is an array that the others do not write.
         """
-        row = self._memory.variables[name]
+        row = self.episodes.arrays.variables[name]
         if type(value) is np.ndarray and value.dtype == row.dtype and value.shape == row.shape:
             is_apart = count == 1 or (value.base is None and not self._holds(value))
             return value if is_apart else value.copy()
@@ -220,4 +212,4 @@ class ArrayEngine(BatchEngine):
         return array.astype(dtype, copy=False)
 
     def _holds(self, value: npt.NDArray[Any]) -> bool:
-        return any(value is row for row in self._memory.variables.values())
+        return any(value is row for row in self.episodes.arrays.variables.values())

@@ -1,1 +1,0 @@
-"""Three ways to play N environments: by programs, with hooks on arrays, or one by one."""

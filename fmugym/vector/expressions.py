@@ -1,0 +1,329 @@
+"""Task of expressions: their programs run in the pool's step."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from math import isfinite
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.pool.base import FloatArray, MaskArray, Played
+from fmugym.pool.bundle import IndexArray
+from fmugym.pool.extension import require_refusal
+from fmugym.pool.licences import require_started
+from fmugym.task import spaces as fmu_spaces
+from fmugym.task.construction import draws_of_reset
+from fmugym.task.future import assumed, future_of
+from fmugym.task.native_draws import no_draws
+from fmugym.vector import faults
+from fmugym.vector.action_arrays import checked_actions
+from fmugym.vector.array_episodes import ArrayEpisodes
+from fmugym.vector.hooks import hook_results
+from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.infos import drawn_info, late_info, observation_of, rows_not_finite
+from fmugym.vector.layout import Layout
+from fmugym.vector.step_form import prepare_step
+from fmugym.vector.tasks import StepResult, Task
+
+__all__ = ["Expressions"]
+
+_REFUSALS = (TypeError, ValueError, BufferError)
+"""What the pool raises if it does not take the arguments of a step."""
+
+
+class Expressions(Task):
+    """Task of N environments whose hooks are expressions.
+
+    The pool does a step in one call, programs included. It also starts episodes by itself, unless
+    there is something to do that only Python can: see ``_pool_starts``.
+
+    Args:
+        env: The prototype, made with a pool of N instances.
+        num_envs: N.
+        max_episode_steps: Truncates episodes, in addition to the config's own limit.
+        programs: Those of the expressions.
+    """
+
+    way = "expressions"
+    episodes: ArrayEpisodes
+
+    def __init__(self, env: FMUEnv, max_episode_steps: int | None, programs: TaskPrograms) -> None:
+        super().__init__(ArrayEpisodes(env, env._instance.pool))
+        self.env, self._n = env, self._pool.num_instances
+        self._limit = min(env.step_limit, max_episode_steps or sys.maxsize)
+        self._prepare(programs)
+
+    def settle(self) -> None:
+        """See ``Task.settle``."""
+        self._prepare(self._programs)
+
+    def _prepare(self, programs: TaskPrograms) -> None:
+        """Give the pool everything it needs for steps."""
+        env, episodes = self.env, self.episodes
+        draws, native = env.episode_start, env.episode_start.native
+        self._programs = programs
+        episodes.hold(programs.variables)
+        layout = Layout(programs, env, self._n)
+        self._play = prepare_step(
+            env,
+            episodes.arrays,
+            programs,
+            episodes.start_values,
+            (native or no_draws(), draws.drawn if native else (), episodes.streams.states),
+            self._limit,
+            (StepResult, *layout.form, layout.shapes, late_info(draws)),
+        )
+        starts, rows = env.config.episode_variables, episodes.arrays.variables
+        fit = all(np.shape(start) == rows[n].shape[:-1] for n, start in starts.items())
+        is_free = env._warm_ups is None and not self._pool.retries_resets
+        self._may_start = self._pool.plays_alone and native is not None and fit and is_free
+
+    @property
+    def _pool_starts(self) -> bool:
+        """Whether the pool itself starts episodes, in its step or in a reset.
+
+        Python does so where others step the FMUs, where it has to draw values or to set episode
+        variables, where something goes with resets, and where constants are not the usual ones.
+        """
+        return self._may_start and self.episodes.start_as_declared
+
+    # Episodes
+
+    def reset(
+        self,
+        mask: MaskArray,
+        seeds: Sequence[int | None] | None = None,
+        options: Mapping[str, Any] = {},
+    ) -> tuple[Any, dict[str, Any]]:
+        """See ``Task.reset``."""
+        self.has_moved = False
+        indices, streams = np.flatnonzero(mask), self.episodes.streams
+        streams.seed(seeds, indices)
+        streams.require_seeds()
+        done = None if options else self.reset_by({"reset_mask": mask})
+        if done is not None:
+            return done
+        draws = draws_of_reset(self.env, options, "reset_mask")
+        drawn = streams.draw(draws, indices)
+        self.has_moved = True
+        self.episodes.begin(indices, draws, drawn)
+        try:
+            observations, infos = self._first(None, mask)
+        finally:
+            self.episodes.note_starts(mask)
+        return observations, infos | drawn_info(draws, drawn, mask.copy())
+
+    def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
+        """See ``Task.reset_by``."""
+        if not self._pool_starts or self._play.reset is None:
+            return None
+        try:
+            done = self._play.reset(options)
+        except BaseException:
+            self.has_moved = True
+            raise
+        if done is None:
+            return None
+        (observations, infos), troubled, self.episodes.any_ended = done
+        if troubled:
+            self.has_moved = True
+            require_started(self._pool, np.flatnonzero(infos["_drawn"]))
+        return self._first_by_pool(observations, infos, troubled)
+
+    def _first_by_pool(
+        self, observations: Any, infos: dict[str, Any], troubled: int
+    ) -> tuple[Any, dict[str, Any]]:
+        """The result of a reset by the pool; impossible first observations are refused."""
+        if troubled:
+            self.require_finite_start(observations, infos["_drawn"])
+        return observations, infos
+
+    def _first(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos where episodes have started; refuse impossible starts.
+
+        Args:
+            observations: Those that the pool has made; None for those of the hook.
+            mask: Where episodes have started.
+        """
+        if observations is None:
+            observations = self.observations()
+        self.require_finite_start(observations, mask)
+        return observations, self.infos(mask)
+
+    def require_finite_start(self, observations: Any, mask: MaskArray) -> None:
+        """Refuse first observations that are not finite.
+
+        Raises:
+            SimulationError: If there is one in the mask.
+        """
+        wrong = rows_not_finite(observations)
+        if wrong is not None and (wrong & mask).any():
+            index = int(np.flatnonzero(wrong & mask)[0])
+            first = shown(observation_of(observations, index))
+            raise SimulationError(
+                f"environment {index}: the first observation is not finite: {first}"
+            )
+
+    @contextmanager
+    def assuming(
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
+    ) -> Iterator[None]:
+        """See ``Task.assuming``."""
+        own, self.offsets = self._programs, offsets
+        try:
+            with assumed([future_of(self.env)], tables) as others:
+                if others:
+                    self._prepare(own.with_tables(others))
+                yield
+        finally:
+            self.offsets = None
+            if tables:
+                self._prepare(own)
+
+    def observe(self, indices: IndexArray) -> Any:
+        """See ``Task.observe``."""
+        mask = np.zeros(self._n, np.bool_)
+        mask[indices] = True
+        return self._first(None, mask)[0]
+
+    # Steps
+
+    def _step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> StepResult:
+        """See ``Task._step``; a pool that can does all of it in one call."""
+        is_native = self._play.step is not None and self.offsets is None
+        if not is_native or not (fresh is None or self._pool_starts):
+            return self._compose(actions, fresh, None)
+        return self._completed(self._play_step(actions, fresh, restart), fresh)
+
+    def _play_step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> Played:
+        """Let the pool do the whole step."""
+        at_ends = restart and self._pool_starts
+        play: Any = self._play
+        step = play.step if fresh is None and not at_ends else play.start_and_step
+        self.has_moved = True  # unless the call refuses its arguments
+        try:
+            played: Played = step(actions, at_ends)
+            return played
+        except _REFUSALS as error:
+            return self._play_step(self._converted(actions, error), fresh, restart)
+
+    def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
+        """See ``Task._take_actions``; what does not step counts as just started."""
+        taken = self._checked(actions, idle)
+        self.has_moved = True
+        if idle is not None:
+            self.episodes.ended[:] = idle
+        self._play.before(taken)
+        return taken
+
+    def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, before anything is drawn or stepped."""
+        self.has_moved = False
+        try:
+            self._play.check(actions)
+        except _REFUSALS as error:
+            actions = self._converted(actions, error)
+            self._play.check(actions)
+        taken: npt.NDArray[Any] = actions
+        return taken
+
+    def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
+        """The actions in the form that the pool takes, if it has refused another one."""
+        require_refusal(error)
+        self.has_moved = False
+        converted = self._flat(actions)
+        if converted is actions:
+            raise error
+        return converted
+
+    def _flat(self, actions: Any) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, environments first.
+
+        Raises:
+            ConfigError: If they do not fit.
+        """
+        space: Any = self.env.action_space
+        array = checked_actions(space, self._n, actions)
+        if array.dtype != space.dtype:
+            with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
+                array = array.astype(space.dtype)
+        return np.ascontiguousarray(array)
+
+    def _start(self, mask: MaskArray) -> dict[str, Any]:
+        """See ``Task._start``."""
+        draws, indices = self.env.episode_start, np.flatnonzero(mask)
+        drawn = self.episodes.streams.draw(draws, indices)
+        self.episodes.begin(indices, draws, drawn)
+        return drawn_info(draws, drawn, mask)
+
+    def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
+        """See ``Task._conclude``."""
+        result, troubled, any_ended, _ = self._play.after(taken)
+        result.infos.update(started or {})
+        return self._completed((result, troubled, any_ended, idle), idle)
+
+    def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
+        """The result of a step of the pool, in which faults are settled."""
+        result: StepResult
+        result, troubled, self.episodes.any_ended, started = played
+        if troubled:
+            faults.settle(self, result, troubled, idle if started is None else started)
+        return result
+
+    # Hooks, or the expressions in their place, on arrays
+
+    def observations(self) -> Any:
+        """The observations that follow from what hooks read now."""
+        env = self.env
+        return hook_results.observations(env._get_observation(), env.observation_space, self._n)
+
+    def infos(self, mask: MaskArray) -> dict[str, Any]:
+        """The infos that follow from what hooks read now, of the environments in the mask."""
+        if not self.env._conversions.has_info:
+            return {}
+        infos = hook_results.info_arrays(self.env._get_info(), mask)
+        if self.env._instance.tells:
+            infos |= hook_results.info_arrays(self._pool.info(), mask)
+        return infos
+
+    def require_possible_inputs(self, idle: MaskArray | None) -> None:
+        """Refuse inputs that are not finite, which they also are outside of their type's range.
+
+        Args:
+            idle: Which environments do not step, shape (N,); None if all do.
+
+        Raises:
+            ConfigError: If there is such an input.
+        """
+        inputs = self._pool.inputs
+        if not self.env._conversions.input_writer.all_real and not np.isfinite(inputs).all():
+            self._write_inputs(np.array(inputs), idle)
+        self._require_finite(inputs, idle)
+
+    def _write_inputs(self, inputs: FloatArray, idle: MaskArray | None) -> None:
+        hook_results.write_inputs(self.env._get_inputs(), inputs)
+        if not self.env._conversions.input_writer.all_real:
+            for index in self._stepping(idle):
+                inputs[:, index] = fmu_spaces.to_input_types(
+                    self.env.interface.inputs, inputs[:, index]
+                )
+        self._require_finite(inputs, idle)
+
+    def _stepping(self, idle: MaskArray | None) -> list[int]:
+        return [i for i in range(self._n) if idle is None or not idle[i]]
+
+    def _require_finite(self, inputs: FloatArray, idle: MaskArray | None) -> None:
+        if isfinite(np.vdot(inputs, inputs)):  # half the time of what follows
+            return
+        finite = np.isfinite(inputs)
+        for index in self._stepping(idle):
+            if not finite[:, index].all():
+                raise ConfigError(
+                    f"an input of environment {index} is not finite: {inputs[:, index]}"
+                )

@@ -1,0 +1,149 @@
+"""Description of a compiled step for a pool: programs, the arrays that they use, and results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.env import FMUEnv
+from fmugym.expressions.program import LETTERS
+from fmugym.expressions.quantities import PREVIOUS
+from fmugym.pool.base import FloatArray, Play
+from fmugym.task.episode_start import Draw
+from fmugym.vector.episode_arrays import EpisodeArrays, row_of
+from fmugym.vector.hooks.task_programs import TaskPrograms
+
+__all__ = ["prepare_step"]
+
+_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
+"""The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
+
+_KEPT_BY_THE_POOL: Final = frozenset({"previous_state", "previous_action"})
+"""The quantities before the step that the pool keeps by itself, from ``kept`` and ``actions``."""
+
+
+def prepare_step(
+    env: FMUEnv,
+    arrays: EpisodeArrays,
+    task: TaskPrograms,
+    starts: FloatArray,
+    draws: tuple[Any, Sequence[Draw], npt.NDArray[np.uint64]],
+    limit: int,
+    form: tuple[Any, ...],
+) -> Play:
+    """Give the pool of an environment everything it needs for steps.
+
+    Args:
+        env: An environment, for what all have in common.
+        arrays: Those of the episodes.
+        task: The programs; their variables are held.
+        starts: The values of each parameter, a row each.
+        draws: What draws values natively, what it draws, and the streams.
+        limit: The number of steps after which episodes are truncated.
+        form: How the pool makes results: their type, the forms of observations and infos, the
+            shapes and types of their arrays, and what makes the info of a reset.
+    """
+    native, drawn, streams = draws
+    count = len(arrays.ended)
+    *kinds, shapes, late = form
+    flags, real = ((count,), arrays.done.dtype), np.dtype(np.float64)
+    judged = ((count,), real), flags, flags, flags
+    return env._instance.pool.prepare_play(
+        env.episode_start.model_variables,
+        (task.inputs.with_rows(arrays.find), task.judgement.with_rows(arrays.find)),
+        _actions(env, arrays),
+        starts,
+        (native, streams),
+        (arrays.quantities.step_count, arrays.ended, limit),
+        _surroundings(
+            env,
+            arrays,
+            task,
+            drawn,
+            (*kinds, (*shapes, *judged, ((len(drawn), count), real)), late),
+        ),
+    )
+
+
+def _actions(env: FMUEnv, arrays: EpisodeArrays) -> dict[str, Any]:
+    """Description of actions for the pool."""
+    dtype = arrays.actions[0].dtype
+    space: Any = env.action_space
+    is_discrete = isinstance(space, spaces.Discrete)
+    check = 1 if is_discrete else _FLOAT_CHECKS.get(dtype, 0)
+    low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
+    flat = [actions.reshape(-1) for actions in arrays.actions]
+    return {
+        "shape": arrays.actions[0].shape[1:],
+        "letter": LETTERS.get(dtype, dtype.char),
+        "size": dtype.itemsize,
+        "check": check,
+        "lowest": low,
+        "highest": high,
+        "current": flat[0],
+        "previous": flat[1],
+        "none": np.array(env._conversions.no_action, dtype).reshape(-1),
+    }
+
+
+def _surroundings(
+    env: FMUEnv,
+    arrays: EpisodeArrays,
+    task: TaskPrograms,
+    drawn: Sequence[Draw],
+    results: tuple[Any, ...],
+) -> dict[str, Any]:
+    """Description of everything beside the programs; see ``NativePool.prepare_play``.
+
+    Args:
+        env: The environment.
+        arrays: Those of the episodes.
+        task: The programs.
+        drawn: What the pool draws.
+        results: How it makes results.
+    """
+    draws, read = env.episode_start, arrays.quantities
+    count = len(arrays.ended)
+    names = draws.parameter_names
+    flat = {name: row.reshape(-1, count) for name, row in arrays.variables.items()}
+    before = {name: row.reshape(-1, count) for name, row in arrays.before.items()}
+    constants = draws.constant_variables
+    return {
+        "kept": arrays.kept,
+        "done": arrays.done,
+        "reads_kept": task.judgement.loads("kept"),
+        "before_inputs": tuple(
+            (row_of(getattr(read, now), index), row_of(getattr(read, name), index))
+            for name, now in PREVIOUS.items()
+            if name not in _KEPT_BY_THE_POOL
+            for index in range(getattr(read, name).size // count)
+        ),
+        "before_judgement": tuple(
+            pair for name in flat for pair in zip(flat[name], before[name], strict=True)
+        ),
+        "input_starts": tuple(
+            (names.index(name), start) if name in names else (-1, start)
+            for name, start in env.interface.start_inputs
+        ),
+        "drawn_variables": tuple(
+            (flat[draw.name][draw.element or 0], number)
+            for number, draw in enumerate(drawn)
+            if draw.name in flat
+        ),
+        "variable_starts": tuple(
+            (row, np.array(value, row.dtype).tobytes())
+            for name, start in constants.items()
+            if name in flat
+            for row, value in zip(flat[name], _elements(arrays.variables[name], start), strict=True)
+        ),
+        "results": results,
+    }
+
+
+def _elements(row: npt.NDArray[Any], start: Any) -> npt.NDArray[Any]:
+    """The start value of each element of a variable."""
+    return np.broadcast_to(start, row.shape[:-1]).reshape(-1)
