@@ -6,7 +6,7 @@ import copy
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -35,6 +35,7 @@ from fmugym.task.saving import scope_of
 from fmugym.task.snapshot import Snapshot
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.candidates import tables_of
+from fmugym.vector.tasks import VectorTask
 
 __all__ = ["MPC"]
 
@@ -279,13 +280,18 @@ class MPC(Controller):
                 self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
-        with self._copies.task.assuming(tables_of(self._copies.prototype, data), None):
+        with self._assuming(data):
             best = self._search(episode, start, assumed, row)
         episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
         for name, paid in best.costs.items():
             episode.costs[name] = episode.costs.get(name, 0.0) + paid
         self._require_time(start, perf_counter() - begin)
         return np.asarray(self._actions(episode.plan[np.newaxis])[0, 0], np.float64)
+
+    def _assuming(self, data: Mapping[str, Any]) -> AbstractContextManager[None]:
+        """Let the copies read other data of the task inside of a ``with`` block."""
+        task: VectorTask = self._copies.task
+        return task.assuming(tables_of(self._prototype, data), None)
 
     def _require_time(self, start: Snapshot, took: float) -> None:
         if start.method == "replay" and self.budget is not None and took > self.budget:
@@ -337,7 +343,7 @@ class MPC(Controller):
             return
         copied = self._copies
         data = self._foresight.observed(episode.row, row, now)
-        with copied.episodes.assuming(data):
+        with self._assuming(data):
             copied.restore_state(episode.snapshot)
             actions = np.repeat(np.asarray(action)[np.newaxis], self._many, axis=0)
             observations, _, terminated, truncated, _ = copied.step(actions)

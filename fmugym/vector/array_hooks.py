@@ -15,9 +15,10 @@ from fmugym.pool.base import FloatArray, MaskArray, Played
 from fmugym.task.episode import environments_last
 from fmugym.task.hooks import Hooks
 from fmugym.task.step import ORDER, call_hooks
-from fmugym.vector import faults
+from fmugym.vector.array_faults import settle_faults
 from fmugym.vector.expressions import Expressions
 from fmugym.vector.hooks import hook_results
+from fmugym.vector.hooks.array_calls import infos_of_hooks, write_inputs_of_hooks
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.tasks import StepResult, failed_in
 
@@ -84,7 +85,7 @@ class ArrayHooks(Expressions):
         read = self.env._episode
         before, read.action = read.keep(), environments_last(taken)
         try:
-            self._write_inputs(self.episodes.arrays.given, idle)
+            write_inputs_of_hooks(self.env, self.episodes.arrays.given, idle)
             self._keep_variables()
             return taken
         except Exception as error:
@@ -113,7 +114,7 @@ class ArrayHooks(Expressions):
                 seen = hook_results.observations(seen, env.observation_space, self._n)
             infos = result.infos
             if conversions.has_info:
-                infos = self.infos(self._all) | infos
+                infos = infos_of_hooks(env, self._all) | infos
             self._keep_variables()
             self._are_hooks_tried = True
         except Exception as error:
@@ -127,7 +128,7 @@ class ArrayHooks(Expressions):
         self.episodes.arrays.keep_done(terminated)
         self.episodes.note_ends(terminated, truncated)
         result = StepResult(seen, rewards, terminated, truncated, infos)
-        faults.settle(self, result, troubled, started)
+        settle_faults(self.episodes, result, troubled, started)
         return result
 
     def _blame_arrays(self, error: Exception) -> None:

@@ -15,7 +15,7 @@ from fmugym.task.construction import draws_of
 from fmugym.task.episode import READABLE
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.tasks import Task
+from fmugym.vector.tasks import VectorTask
 
 __all__ = ["Attributes", "require_settable"]
 
@@ -59,7 +59,7 @@ class Attributes:
         task: That of the environments, whose episodes keep the values.
     """
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: VectorTask) -> None:
         self._task, self._episodes = task, task.episodes
         self._prototype = task.episodes.prototype
 

@@ -21,7 +21,7 @@ from fmugym.vector.expressions import Expressions
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.making import EnvMaker
-from fmugym.vector.tasks import Task
+from fmugym.vector.tasks import VectorTask
 
 __all__ = ["hook_of_one", "make_task", "no_arrays", "require_own_order"]
 
@@ -44,7 +44,7 @@ _KEYS: Final = {
 
 def make_task(
     maker: EnvMaker, prototype: FMUEnv, pool: Pool, max_episode_steps: int | None
-) -> Task:
+) -> VectorTask:
     """Make the task of N environments.
 
     Expressions run as programs. Hooks that are vectorized are called once a step, on arrays; all

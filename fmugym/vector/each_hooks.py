@@ -24,12 +24,12 @@ from fmugym.task.pictures import note_for_picture
 from fmugym.vector.action_arrays import checked_actions, is_array_space
 from fmugym.vector.codec import gathered, mapped
 from fmugym.vector.separate_episodes import SeparateEpisodes
-from fmugym.vector.tasks import StepResult, Task
+from fmugym.vector.tasks import StepResult, VectorTask
 
 __all__ = ["EachHooks"]
 
 
-class EachHooks(Task):
+class EachHooks(VectorTask):
     """Task whose hooks are called one by one. The FMUs still step together on all threads.
 
     Args:
@@ -57,7 +57,7 @@ class EachHooks(Task):
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] = {},
     ) -> tuple[Any, dict[str, Any]]:
-        """See ``Task.reset``."""
+        """See ``VectorTask.reset``."""
         infos: dict[int, dict[str, Any]] = {}
         self.has_moved = False
         draws_of_reset(self._envs[0], options, "reset_mask")  # it refuses unknown options
@@ -86,7 +86,7 @@ class EachHooks(Task):
     def assuming(
         self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
     ) -> Iterator[None]:
-        """See ``Task.assuming``."""
+        """See ``VectorTask.assuming``."""
         self.offsets = offsets
         try:
             with assumed(map(future_of, self._envs), tables):
@@ -95,7 +95,7 @@ class EachHooks(Task):
             self.offsets = None
 
     def observe(self, indices: IndexArray) -> Any:
-        """See ``Task.observe``."""
+        """See ``VectorTask.observe``."""
         for index in indices.tolist():
             self._observations[index] = _copied(first_observation(self._envs[index])[0])
         return self._joined()
@@ -105,7 +105,7 @@ class EachHooks(Task):
     def step(
         self, actions: Any, *, restart: bool = False, resting: MaskArray | None = None
     ) -> StepResult:
-        """See ``Task.step``."""
+        """See ``VectorTask.step``."""
         self.has_moved = False
         try:
             return super().step(actions, restart=restart, resting=resting)
@@ -116,7 +116,7 @@ class EachHooks(Task):
             raise
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> None:
-        """See ``Task._take_actions``; if an action cannot be used, none has taken any."""
+        """See ``VectorTask._take_actions``; if an action cannot be used, none has taken any."""
         actions, idles = self._actions(actions), np.zeros(len(self._envs)) if idle is None else idle
         running = np.flatnonzero(np.logical_not(idles)).tolist()
         befores: list[tuple[FMUEnv, Any]] = []
@@ -149,14 +149,14 @@ class EachHooks(Task):
         return items
 
     def _add_offsets(self, idle: MaskArray | None = None) -> None:
-        """See ``Task._add_offsets``; the pool has made observations without them."""
+        """See ``VectorTask._add_offsets``; the pool has made observations without them."""
         super()._add_offsets(idle)
         if self.offsets is not None:
             observed = self._pool.observations
             observed[:] = self._pool.outputs[: observed.shape[1]].T
 
     def _start(self, mask: MaskArray) -> dict[int, dict[str, Any]]:
-        """See ``Task._start``; returns the infos by the number of the environment."""
+        """See ``VectorTask._start``; returns the infos by the number of the environment."""
         infos = {}
         for index in np.flatnonzero(mask).tolist():
             observation, infos[index] = self._reset(index, None, {})
@@ -164,7 +164,7 @@ class EachHooks(Task):
         return infos
 
     def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
-        """See ``Task._conclude``; the environments conclude the step one after another."""
+        """See ``VectorTask._conclude``; the environments conclude the step one after another."""
         results: list[Result] = []
         statuses, columns = self._pool.statuses.tolist(), self._pool.outputs.T.tolist()
         idles, infos = [False] * len(columns) if idle is None else idle.tolist(), started or {}

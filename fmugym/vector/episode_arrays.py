@@ -15,7 +15,7 @@ from fmugym.pool.base import MaskArray
 from fmugym.task.episode import Episode
 from fmugym.vector.hooks import hook_results
 
-__all__ = ["EpisodeArrays", "row_of"]
+__all__ = ["EpisodeArrays", "element_row"]
 
 
 class EpisodeArrays:
@@ -96,12 +96,12 @@ class EpisodeArrays:
             case "step_count":
                 return self.quantities.step_count
             case str() if kind in PREVIOUS:
-                return row_of(getattr(self.quantities, kind), index)
+                return element_row(getattr(self.quantities, kind), index)
         arrays = self.variables if kind == "variable" else self.before
         return arrays[name].reshape(-1, self._n)[index]
 
 
-def row_of(array: npt.NDArray[Any], index: int) -> npt.NDArray[Any]:
+def element_row(array: npt.NDArray[Any], index: int) -> npt.NDArray[Any]:
     """The row of an element of a quantity, shape (N,)."""
     row: npt.NDArray[Any] = array.reshape(-1, array.shape[-1])[index]
     return row

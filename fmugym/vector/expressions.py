@@ -5,31 +5,32 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from math import isfinite
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Played
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.licences import require_started
-from fmugym.task import spaces as fmu_spaces
 from fmugym.task.construction import draws_of_reset
 from fmugym.task.future import assumed, future_of
 from fmugym.task.native_draws import no_draws
-from fmugym.vector import faults
 from fmugym.vector.action_arrays import checked_actions
 from fmugym.vector.array_episodes import ArrayEpisodes
-from fmugym.vector.hooks import hook_results
+from fmugym.vector.array_faults import settle_faults
+from fmugym.vector.hooks.array_calls import (
+    infos_of_hooks,
+    observations_of_hooks,
+    require_finite_start,
+)
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import drawn_info, late_info, observation_of, rows_not_finite
+from fmugym.vector.infos import drawn_info, late_info
 from fmugym.vector.layout import Layout
 from fmugym.vector.step_form import prepare_step
-from fmugym.vector.tasks import StepResult, Task
+from fmugym.vector.tasks import StepResult, VectorTask
 
 __all__ = ["Expressions"]
 
@@ -37,7 +38,7 @@ _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
 
 
-class Expressions(Task):
+class Expressions(VectorTask):
     """Task of N environments whose hooks are expressions.
 
     The pool does a step in one call, programs included. It also starts episodes by itself, unless
@@ -60,7 +61,7 @@ class Expressions(Task):
         self._prepare(programs)
 
     def settle(self) -> None:
-        """See ``Task.settle``."""
+        """See ``VectorTask.settle``."""
         self._prepare(self._programs)
 
     def _prepare(self, programs: TaskPrograms) -> None:
@@ -101,7 +102,7 @@ class Expressions(Task):
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] = {},
     ) -> tuple[Any, dict[str, Any]]:
-        """See ``Task.reset``."""
+        """See ``VectorTask.reset``."""
         self.has_moved = False
         indices, streams = np.flatnonzero(mask), self.episodes.streams
         streams.seed(seeds, indices)
@@ -120,7 +121,7 @@ class Expressions(Task):
         return observations, infos | drawn_info(draws, drawn, mask.copy())
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
-        """See ``Task.reset_by``."""
+        """See ``VectorTask.reset_by``."""
         if not self._pool_starts or self._play.reset is None:
             return None
         try:
@@ -141,7 +142,7 @@ class Expressions(Task):
     ) -> tuple[Any, dict[str, Any]]:
         """The result of a reset by the pool; impossible first observations are refused."""
         if troubled:
-            self.require_finite_start(observations, infos["_drawn"])
+            require_finite_start(observations, infos["_drawn"])
         return observations, infos
 
     def _first(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
@@ -152,29 +153,15 @@ class Expressions(Task):
             mask: Where episodes have started.
         """
         if observations is None:
-            observations = self.observations()
-        self.require_finite_start(observations, mask)
-        return observations, self.infos(mask)
-
-    def require_finite_start(self, observations: Any, mask: MaskArray) -> None:
-        """Refuse first observations that are not finite.
-
-        Raises:
-            SimulationError: If there is one in the mask.
-        """
-        wrong = rows_not_finite(observations)
-        if wrong is not None and (wrong & mask).any():
-            index = int(np.flatnonzero(wrong & mask)[0])
-            first = shown(observation_of(observations, index))
-            raise SimulationError(
-                f"environment {index}: the first observation is not finite: {first}"
-            )
+            observations = observations_of_hooks(self.env)
+        require_finite_start(observations, mask)
+        return observations, infos_of_hooks(self.env, mask)
 
     @contextmanager
     def assuming(
         self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
     ) -> Iterator[None]:
-        """See ``Task.assuming``."""
+        """See ``VectorTask.assuming``."""
         own, self.offsets = self._programs, offsets
         try:
             with assumed([future_of(self.env)], tables) as others:
@@ -187,7 +174,7 @@ class Expressions(Task):
                 self._prepare(own)
 
     def observe(self, indices: IndexArray) -> Any:
-        """See ``Task.observe``."""
+        """See ``VectorTask.observe``."""
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
         return self._first(None, mask)[0]
@@ -195,7 +182,7 @@ class Expressions(Task):
     # Steps
 
     def _step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> StepResult:
-        """See ``Task._step``; a pool that can does all of it in one call."""
+        """See ``VectorTask._step``; a pool that can does all of it in one call."""
         is_native = self._play.step is not None and self.offsets is None
         if not is_native or not (fresh is None or self._pool_starts):
             return self._compose(actions, fresh, None)
@@ -214,7 +201,7 @@ class Expressions(Task):
             return self._play_step(self._converted(actions, error), fresh, restart)
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
-        """See ``Task._take_actions``; what does not step counts as just started."""
+        """See ``VectorTask._take_actions``; what does not step counts as just started."""
         taken = self._checked(actions, idle)
         self.has_moved = True
         if idle is not None:
@@ -256,14 +243,14 @@ class Expressions(Task):
         return np.ascontiguousarray(array)
 
     def _start(self, mask: MaskArray) -> dict[str, Any]:
-        """See ``Task._start``."""
+        """See ``VectorTask._start``."""
         draws, indices = self.env.episode_start, np.flatnonzero(mask)
         drawn = self.episodes.streams.draw(draws, indices)
         self.episodes.begin(indices, draws, drawn)
         return drawn_info(draws, drawn, mask)
 
     def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
-        """See ``Task._conclude``."""
+        """See ``VectorTask._conclude``."""
         result, troubled, any_ended, _ = self._play.after(taken)
         result.infos.update(started or {})
         return self._completed((result, troubled, any_ended, idle), idle)
@@ -273,57 +260,5 @@ class Expressions(Task):
         result: StepResult
         result, troubled, self.episodes.any_ended, started = played
         if troubled:
-            faults.settle(self, result, troubled, idle if started is None else started)
+            settle_faults(self.episodes, result, troubled, idle if started is None else started)
         return result
-
-    # Hooks, or the expressions in their place, on arrays
-
-    def observations(self) -> Any:
-        """The observations that follow from what hooks read now."""
-        env = self.env
-        return hook_results.observations(env._get_observation(), env.observation_space, self._n)
-
-    def infos(self, mask: MaskArray) -> dict[str, Any]:
-        """The infos that follow from what hooks read now, of the environments in the mask."""
-        if not self.env._conversions.has_info:
-            return {}
-        infos = hook_results.info_arrays(self.env._get_info(), mask)
-        if self.env._instance.tells:
-            infos |= hook_results.info_arrays(self._pool.info(), mask)
-        return infos
-
-    def require_possible_inputs(self, idle: MaskArray | None) -> None:
-        """Refuse inputs that are not finite, which they also are outside of their type's range.
-
-        Args:
-            idle: Which environments do not step, shape (N,); None if all do.
-
-        Raises:
-            ConfigError: If there is such an input.
-        """
-        inputs = self._pool.inputs
-        if not self.env._conversions.input_writer.all_real and not np.isfinite(inputs).all():
-            self._write_inputs(np.array(inputs), idle)
-        self._require_finite(inputs, idle)
-
-    def _write_inputs(self, inputs: FloatArray, idle: MaskArray | None) -> None:
-        hook_results.write_inputs(self.env._get_inputs(), inputs)
-        if not self.env._conversions.input_writer.all_real:
-            for index in self._stepping(idle):
-                inputs[:, index] = fmu_spaces.to_input_types(
-                    self.env.interface.inputs, inputs[:, index]
-                )
-        self._require_finite(inputs, idle)
-
-    def _stepping(self, idle: MaskArray | None) -> list[int]:
-        return [i for i in range(self._n) if idle is None or not idle[i]]
-
-    def _require_finite(self, inputs: FloatArray, idle: MaskArray | None) -> None:
-        if isfinite(np.vdot(inputs, inputs)):  # half the time of what follows
-            return
-        finite = np.isfinite(inputs)
-        for index in self._stepping(idle):
-            if not finite[:, index].all():
-                raise ConfigError(
-                    f"an input of environment {index} is not finite: {inputs[:, index]}"
-                )

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.vector.codec import mapped
-from fmugym.vector.hooks.task_programs import TaskPrograms
 
 __all__ = ["Layout"]
 

@@ -19,7 +19,7 @@ from fmugym.vector.candidates import Candidates
 from fmugym.vector.codec import mapped
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import copy_rows
-from fmugym.vector.tasks import StepResult, Task
+from fmugym.vector.tasks import StepResult, VectorTask
 
 __all__ = [
     "Rollout",
@@ -154,7 +154,7 @@ def returning_to(episodes: Episodes, present: Snapshot | None) -> Iterator[None]
             episodes.is_ready = True
 
 
-def roll_out(task: Task, start: Snapshot, candidates: Candidates) -> Rollout:
+def roll_out(task: VectorTask, start: Snapshot, candidates: Candidates) -> Rollout:
     """Let the environments play all candidates, as many at a time as there are environments.
 
     Args:
@@ -167,7 +167,7 @@ def roll_out(task: Task, start: Snapshot, candidates: Candidates) -> Rollout:
     return joined_rollouts(parts, candidates.count)
 
 
-def _play(task: Task, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
+def _play(task: VectorTask, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
     """Let each environment play the candidate at its place, until all of these have ended."""
     actions, episodes = candidates.actions(places), task.episodes
     _begin(episodes, start, places, candidates)

@@ -14,8 +14,7 @@ from fmugym.expressions.program import LETTERS
 from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.base import FloatArray, Play
 from fmugym.task.episode_start import Draw
-from fmugym.vector.episode_arrays import EpisodeArrays, row_of
-from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.episode_arrays import EpisodeArrays, element_row
 
 __all__ = ["prepare_step"]
 
@@ -117,7 +116,7 @@ def _surroundings(
         "done": arrays.done,
         "reads_kept": task.judgement.loads("kept"),
         "before_inputs": tuple(
-            (row_of(getattr(read, now), index), row_of(getattr(read, name), index))
+            (element_row(getattr(read, now), index), element_row(getattr(read, name), index))
             for name, now in PREVIOUS.items()
             if name not in _KEPT_BY_THE_POOL
             for index in range(getattr(read, name).size // count)

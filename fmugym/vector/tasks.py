@@ -16,7 +16,7 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import final_infos, last_observations, merged, restricted
 
-__all__ = ["StepResult", "Task", "failed_in"]
+__all__ = ["StepResult", "VectorTask", "failed_in"]
 
 
 def failed_in(statuses: StatusArray) -> MaskArray:
@@ -35,7 +35,7 @@ class StepResult(NamedTuple):
     infos: dict[str, Any]
 
 
-class Task(ABC):
+class VectorTask(ABC):
     """Conversion of actions to inputs, and of outputs to observations, rewards and ends.
 
     Args:

@@ -43,7 +43,7 @@ from fmugym.vector.episodes import Episodes
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
 from fmugym.vector.rollouts import Rollout, returning_to, roll_out, start_of_rollout
-from fmugym.vector.tasks import StepResult, Task
+from fmugym.vector.tasks import StepResult, VectorTask
 from fmugym.vector.vector_saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv", "require_open"]
@@ -95,7 +95,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     prototype: FMUEnv
     pool: Pool
-    task: Task
+    task: VectorTask
     episodes: Episodes
     attributes: Attributes
     maker: EnvMaker

@@ -3,7 +3,7 @@
 import fuzz_driver
 import fuzz_hooks
 
-from fmugym.vector import faults
+from fmugym.vector import array_faults
 
 
 def test_odd_hooks_raise_nothing_but_our_own_errors():
@@ -17,6 +17,6 @@ def test_odd_hooks_raise_nothing_but_our_own_errors():
 
 def test_a_failure_is_reported(monkeypatch):
     """The fuzzing is able to fail: with a reward that is passed on."""
-    monkeypatch.setattr(faults, "_handle", lambda *given: None)
+    monkeypatch.setattr(array_faults, "_handle", lambda *given: None)
     failures = fuzz_driver.run(fuzz_hooks.program, 60, seed="tests", first=640).failures
     assert any(": rewards" in failure for failure in failures)
