@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.vector.codec import mapped
+from fmugym.vector.hooks.task_programs import TaskPrograms
 
 __all__ = ["Layout"]
 

@@ -17,6 +17,7 @@ from fmugym.task.native_draws import no_draws
 from fmugym.task.saving import READ
 from fmugym.vector.episode_arrays import EpisodeArrays
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
+from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.layout import Layout
 from fmugym.vector.step_form import prepare_step
 from fmugym.vector.views import EpisodeColumn, batched

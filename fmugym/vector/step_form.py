@@ -15,6 +15,7 @@ from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.base import FloatArray, Play
 from fmugym.task.episode_start import Draw
 from fmugym.vector.episode_arrays import EpisodeArrays, element_row
+from fmugym.vector.hooks.task_programs import TaskPrograms
 
 __all__ = ["prepare_step"]
 
