@@ -219,7 +219,7 @@ class Pool:
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
-    def play(self, actions: Array, at_ends: bool, /) -> tuple[Any, int, bool, Array | None]:
+    def play(self, actions: Array, at_ends: bool, /) -> tuple[Any, ...]:
         """Do a step, with all that was taken over; see ``Play.step`` of ``fmugym.pool.base``.
 
         Raises:
@@ -238,14 +238,14 @@ class Pool:
         without paths of libraries.
         """
 
-    def play_after(self, actions: Array, /) -> tuple[Any, int, bool, None]:
+    def play_after(self, actions: Array, /) -> tuple[Any, ...]:
         """Do what comes after the FMUs' part of ``play``.
 
         The outputs and statuses are those that the pool's arrays have. The results and errors are
         those of ``play``.
         """
 
-    def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
+    def reset_by(self, options: Any, /) -> tuple[Any, ...] | None:
         """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
 
     def count_steps(self) -> None:

@@ -164,9 +164,9 @@ class _Perturbation:
         for index, action in enumerate(nominal):
             bundles.append(self._pool.save_instances(_FIRST))
             columns.append(self._episodes.columns(_FIRST))
-            result = self._task.step(np.repeat(action[None], count, axis=0))
+            _, _, terminated, truncated, _ = self._task.step(np.repeat(action[None], count, axis=0))
             self._require_fine(f"step {index + 1}", _FIRST)
-            if (result.terminated | result.truncated)[0] and index + 1 < len(nominal):
+            if (terminated | truncated)[0] and index + 1 < len(nominal):
                 raise SimulationError(
                     f"the episode ends after {index + 1} of {len(nominal)} steps: no step follows "
                     "that could be linearized"

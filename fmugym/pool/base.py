@@ -33,7 +33,7 @@ StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
 
 
-Played = tuple[Any, int, bool, MaskArray | None]
+Played = tuple[int, bool, Any, Any, Any, tuple[Any, ...], tuple[Any, Any, Any] | None]
 """What a step with programs returns; see ``Play.step``."""
 
 
@@ -50,17 +50,19 @@ class Play(NamedTuple):
         after: Takes the same actions, and returns what ``step`` returns.
         step: A function of actions and a flag; it does a step, and starts the episodes that have
             ended before it. If the flag is True, an episode that ends without a fault is followed
-            by the next one in the same step. It returns the result; how many instances had trouble
-            (a status worse than a warning, or numbers that are not finite); whether any episode is
-            at its end now; and where episodes have started, shape (N,), or None. The infos of the
-            result then tell of these starts. All arrays are new, or those of an earlier step that
-            nobody holds any more.
+            by the next one in the same step. It returns seven values: how many instances had
+            trouble (a status worse than a warning, or numbers that are not finite); whether any
+            episode is at its end now; rewards, terminated, truncated, shape (N,); a tuple of the
+            arrays of observations and infos; and None, or, if episodes have started, a tuple of
+            where, shape (N,), what they have drawn, shape (draws, N), and the last observations
+            and infos of those that have ended in this step, or None. All arrays are new, or those
+            of an earlier step that nobody holds any more.
         start_and_step: The same; to be called if episodes may start.
         reset: A function of the options of a reset. If they are a dict of nothing but
             ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
-            it starts these episodes and returns the result of the reset, how many instances had
-            trouble, and whether any episode is at its end now. Otherwise it does nothing and
-            returns None.
+            it starts these episodes and returns how many instances had trouble, whether any episode
+            is at its end now, the arrays of observations and infos, a copy of the mask, and what
+            was drawn. Otherwise it does nothing and returns None.
     """
 
     check: Callable[[Any], None]
@@ -68,7 +70,7 @@ class Play(NamedTuple):
     after: Callable[[Any], Played]
     step: Callable[[Any, bool], Played] | None = None
     start_and_step: Callable[[Any, bool], Played] | None = None
-    reset: Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None] | None = None
+    reset: Callable[[Any], tuple[int, bool, tuple[Any, ...], Any, Any] | None] | None = None
 
 
 class Pool(ABC):

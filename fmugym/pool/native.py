@@ -312,12 +312,10 @@ def prepare(
             they are kept before a program replaces them; ``drawn_variables``, rows and the numbers
             of their draws; ``variable_starts``, rows and the bytes of their constants;
             ``input_starts``, for each input the number of a start value, or -1 and a constant.
-            ``results``, a tuple of ``numpy.empty``; the class of a step's result, a tuple; the
-            forms of observations and of infos, each the number of an array, or a tuple of names and
-            forms; the shape and type of each array: float32 observations, or those that the second
-            program stores, then rewards, terminated and truncated of a step, mask and drawn values
-            (draws, N) of a reset; and a function of drawn values and a mask, which returns what
-            infos tell of the episodes that start.
+            ``results``, whether to return numbers in the place of arrays of one; and the shape and
+            type of each array: float32 observations, or those that the second program stores, then
+            rewards, terminated and truncated of a step, mask and drawn values (draws, N) of a
+            reset.
     """
     counts, ended, limit = episodes
     rows = Rows()

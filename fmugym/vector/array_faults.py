@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE
-from fmugym.pool.base import MaskArray
+from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
 from fmugym.task.faults import not_finite
@@ -27,8 +28,16 @@ from fmugym.vector.tasks import StepResult, failed_in
 __all__ = ["settle_faults"]
 
 
+class _Result(NamedTuple):
+    observations: Any
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    infos: dict[str, Any]
+
+
 def settle_faults(
-    episodes: ArrayEpisodes, result: StepResult, troubled: int, started: MaskArray | None
+    episodes: ArrayEpisodes, of_step: StepResult, troubled: int, started: MaskArray | None
 ) -> None:
     """Find numbers that are not finite, and handle them and failures.
 
@@ -36,7 +45,7 @@ def settle_faults(
 
     Args:
         episodes: The episodes.
-        result: Of the step; it is corrected.
+        of_step: The result of the step; its arrays and infos are corrected.
         troubled: How many FMUs have a status worse than a warning, or numbers that a program found
             not finite.
         started: Which environments have started an episode in this step; None for none.
@@ -46,6 +55,7 @@ def settle_faults(
         SimulationError: If an episode cannot start, or after a fault with ``on_fault="raise"``.
     """
     env = episodes.prototype
+    result = _Result(*of_step)
     rewards = rows_not_finite(result.rewards)
     is_told = env._conversions.pool_observes and not troubled
     observations = None if is_told else rows_not_finite(result.observations)
@@ -62,7 +72,7 @@ def settle_faults(
 
 
 def _handle(
-    episodes: ArrayEpisodes, result: StepResult, wrong: tuple[MaskArray | None, MaskArray | None]
+    episodes: ArrayEpisodes, result: _Result, wrong: tuple[MaskArray | None, MaskArray | None]
 ) -> None:
     """Handle FMUs that failed or asked to stop, and numbers that are not finite.
 
@@ -83,14 +93,14 @@ def _handle(
         _end(episodes, result, dict(sorted(reasons.items())), failed)
 
 
-def _not_finite(episodes: ArrayEpisodes, result: StepResult, index: int) -> str:
+def _not_finite(episodes: ArrayEpisodes, result: _Result, index: int) -> str:
     observation = observation_of(result.observations, index)
     with episodes.single(index) as env:
         return not_finite(env, result.rewards[index], observation)
 
 
 def _end(
-    episodes: ArrayEpisodes, result: StepResult, reasons: Mapping[int, str], failed: MaskArray
+    episodes: ArrayEpisodes, result: _Result, reasons: Mapping[int, str], failed: MaskArray
 ) -> None:
     """End the episodes of some environments, in the state before the step."""
     env, count = episodes.prototype, len(failed)
@@ -118,7 +128,7 @@ def _end(
 
 
 def _see_again(
-    episodes: ArrayEpisodes, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]
+    episodes: ArrayEpisodes, result: _Result, mask: MaskArray, reasons: Mapping[int, str]
 ) -> None:
     """Observe environments in the state before a step, with ``done`` of their fault."""
     env = episodes.prototype

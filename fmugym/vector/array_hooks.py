@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from traceback import walk_tb
 from typing import Any, Final, cast
@@ -51,13 +52,12 @@ class ArrayHooks(Expressions):
     # Episodes
 
     def _first_by_pool(
-        self, observations: Any, infos: dict[str, Any], troubled: int
+        self, seen: Sequence[Any], mask: MaskArray, troubled: int
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Expressions._first_by_pool``."""
         self.has_moved = True
-        made = observations if self.env._conversions.pool_observes else None
-        observations, more = self._first(made, infos["_drawn"])
-        return observations, more | infos
+        is_there = self.env._conversions.pool_observes
+        return self._first(self._layout.parts(seen)[0] if is_there else None, mask)
 
     def _first(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
         """See ``Expressions._first``."""
@@ -97,22 +97,22 @@ class ArrayHooks(Expressions):
     def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
         """See ``Expressions._completed``; the hooks that follow the FMUs' step are called."""
         env, conversions = self.env, self.env._conversions
-        result, troubled, _, started = played
-        started = idle if started is None else started
+        troubled, _, _, terminated, truncated, seen, starts = played
+        infos = {} if starts is None else self._infos_of_starts(*starts)
+        started = idle if starts is None else starts[0]
         self._idle = started
         if troubled:
             failed = failed_in(self._pool.statuses)
             self._idle = failed if started is None else failed | started
         self._busy = None if self._idle is None else ~self._idle
-        observed = result.observations if conversions.pool_observes else None
+        made = seen[0] if conversions.pool_observes else None
         try:
-            stopped = result.terminated if troubled else False
-            seen, rewards, terminated, truncated = call_hooks(
-                env, self, stopped, result.truncated, observed
+            stopped = terminated if troubled else False
+            observed, rewards, terminated, truncated = call_hooks(
+                env, self, stopped, truncated, made
             )
-            if observed is None:
-                seen = hook_results.observations(seen, env.observation_space, self._n)
-            infos = result.infos
+            if made is None:
+                observed = hook_results.observations(observed, env.observation_space, self._n)
             if conversions.has_info:
                 infos = infos_of_hooks(env, self._all) | infos
             self._keep_variables()
@@ -127,7 +127,7 @@ class ArrayHooks(Expressions):
             np.copyto(rewards, 0.0, where=started)
         self.episodes.arrays.keep_done(terminated)
         self.episodes.note_ends(terminated, truncated)
-        result = StepResult(seen, rewards, terminated, truncated, infos)
+        result = observed, rewards, terminated, truncated, infos
         settle_faults(self.episodes, result, troubled, started)
         return result
 

@@ -189,15 +189,10 @@ class EachHooks(VectorTask):
         counts = [env._episode.step_count for env in self._envs]
         truncated |= np.array(counts) >= self._limit
         truncated &= True if idle is None else ~idle
-        result = StepResult(
-            self._joined(),
-            np.array(rewards, np.float64),
-            np.array(terminated, np.bool_),
-            truncated,
-            gathered({i: info for i, info in enumerate(infos) if info}, len(infos)),
-        )
-        self.episodes.note_ends(result.terminated, result.truncated)
-        return result
+        ends = np.array(terminated, np.bool_)
+        self.episodes.note_ends(ends, truncated)
+        told = gathered({i: info for i, info in enumerate(infos) if info}, len(infos))
+        return self._joined(), np.array(rewards, np.float64), ends, truncated, told
 
     def _joined(self) -> Any:
         """The observations of all in new arrays."""

@@ -27,7 +27,7 @@ from fmugym.vector.hooks.array_calls import (
     require_finite_start,
 )
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import drawn_info, late_info
+from fmugym.vector.infos import drawn_info, final_infos, started_info
 from fmugym.vector.layout import Layout
 from fmugym.vector.step_form import prepare_step
 from fmugym.vector.tasks import StepResult, VectorTask
@@ -70,7 +70,7 @@ class Expressions(VectorTask):
         draws, native = env.episode_start, env.episode_start.native
         self._programs = programs
         episodes.hold(programs.variables)
-        layout = Layout(programs, env, self._n)
+        self._layout = layout = Layout(programs, env, self._n)
         self._play = prepare_step(
             env,
             episodes.arrays,
@@ -78,7 +78,7 @@ class Expressions(VectorTask):
             episodes.start_values,
             (native or no_draws(), draws.drawn if native else (), episodes.streams.states),
             self._limit,
-            (StepResult, *layout.form, layout.shapes, late_info(draws)),
+            (False, layout.shapes),
         )
         starts, rows = env.config.episode_variables, episodes.arrays.variables
         fit = all(np.shape(start) == rows[n].shape[:-1] for n, start in starts.items())
@@ -131,18 +131,20 @@ class Expressions(VectorTask):
             raise
         if done is None:
             return None
-        (observations, infos), troubled, self.episodes.any_ended = done
+        troubled, self.episodes.any_ended, seen, mask, drawn = done
         if troubled:
             self.has_moved = True
-            require_started(self._pool, np.flatnonzero(infos["_drawn"]))
-        return self._first_by_pool(observations, infos, troubled)
+            require_started(self._pool, np.flatnonzero(mask))
+        observations, infos = self._first_by_pool(seen, mask, troubled)
+        return observations, infos | started_info(self.env.episode_start, drawn, mask)
 
     def _first_by_pool(
-        self, observations: Any, infos: dict[str, Any], troubled: int
+        self, seen: Sequence[Any], mask: MaskArray, troubled: int
     ) -> tuple[Any, dict[str, Any]]:
         """The result of a reset by the pool; impossible first observations are refused."""
+        observations, infos = self._layout.parts(seen, mask)
         if troubled:
-            require_finite_start(observations, infos["_drawn"])
+            require_finite_start(observations, mask)
         return observations, infos
 
     def _first(self, observations: Any, mask: MaskArray) -> tuple[Any, dict[str, Any]]:
@@ -251,14 +253,29 @@ class Expressions(VectorTask):
 
     def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
         """See ``VectorTask._conclude``."""
-        result, troubled, any_ended, _ = self._play.after(taken)
-        result.infos.update(started or {})
-        return self._completed((result, troubled, any_ended, idle), idle)
+        result = self._completed(self._play.after(taken), idle)
+        result[-1].update(started or {})
+        return result
 
     def _completed(self, played: Played, idle: MaskArray | None) -> StepResult:
         """The result of a step of the pool, in which faults are settled."""
-        result: StepResult
-        result, troubled, self.episodes.any_ended, started = played
+        troubled, self.episodes.any_ended, rewards, terminated, truncated, seen, starts = played
+        layout, started = self._layout, None
+        observations, infos = (seen[0], {}) if layout.is_plain else layout.parts(seen)
+        if starts is not None:
+            started = starts[0]
+            infos |= self._infos_of_starts(*starts)
+        result = observations, rewards, terminated, truncated, infos
         if troubled:
             settle_faults(self.episodes, result, troubled, idle if started is None else started)
         return result
+
+    def _infos_of_starts(
+        self, started: MaskArray, drawn: FloatArray, last: Sequence[Any] | None
+    ) -> dict[str, Any]:
+        """The infos of episodes that have started in a step of the pool; see ``Play.step``."""
+        infos = started_info(self.env.episode_start, drawn, started)
+        if last is None:
+            return infos
+        observations, told = self._layout.parts(last, started)
+        return infos | final_infos(observations, told, started)

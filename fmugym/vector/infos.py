@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from math import isfinite
 from operator import getitem
 from typing import Any
@@ -15,7 +14,7 @@ from gymnasium import spaces
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import environments_first
 from fmugym.task.episode_start import EpisodeStart
-from fmugym.task.values import UNFILLED, LateDict
+from fmugym.task.values import LateDict
 from fmugym.vector.codec import coded, mapped, masked
 
 __all__ = [
@@ -23,11 +22,11 @@ __all__ = [
     "drawn_info",
     "final_infos",
     "last_observations",
-    "late_info",
     "merged",
     "observation_of",
     "restricted",
     "rows_not_finite",
+    "started_info",
 ]
 
 
@@ -41,12 +40,12 @@ def drawn_info(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[
     """
     of_all = np.zeros((len(drawn), len(mask)))
     of_all[:, mask] = drawn
-    return {"drawn": LateDict.of(_told, draws, of_all, mask), "_drawn": mask}  # rarely read
+    return started_info(draws, of_all, mask)
 
 
-def late_info(draws: EpisodeStart) -> tuple[Any, ...]:
-    """Function for the C extension, which makes ``"drawn"`` from drawn values and a mask."""
-    return LateDict, UNFILLED, partial(_told, draws)
+def started_info(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    """The same of values drawn for all environments, shape (draws, N)."""
+    return {"drawn": LateDict.of(_told, draws, drawn, mask), "_drawn": mask}  # rarely read
 
 
 def _told(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

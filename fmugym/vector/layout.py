@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.vector.codec import mapped
+from fmugym.pool.base import MaskArray
+from fmugym.vector.codec import coded, mapped, with_masks
 from fmugym.vector.hooks.task_programs import TaskPrograms
 
-__all__ = ["Layout"]
+__all__ = ["Layout", "LayoutOfOne"]
 
 
 class Layout:
@@ -25,8 +26,7 @@ class Layout:
 
     Attributes:
         shapes: The shape and type of each array.
-        form: That of the observations and that of the infos, as the pool takes them: the number of
-            an array, or a tuple of names and forms.
+        is_plain: Whether there is one array, the observations, and there are no infos.
     """
 
     def __init__(self, task: TaskPrograms, env: FMUEnv, count: int) -> None:
@@ -35,45 +35,60 @@ class Layout:
         if not task.seen and env._conversions.pool_observes:
             self._paths = [("observation",)]
             self.shapes = (((count, env.interface.output_count), np.dtype(np.float32)),)
-        observations, infos = self._nested(range(len(self._paths)))
-        self.form = _pairs(observations), _pairs(infos)
+        self.is_plain = self._paths == [("observation",)]
+        self._everywhere = np.ones(count, np.bool_)
 
-    def of_one(self) -> tuple[tuple[Any, ...], Any, Callable[[Any], tuple[Any, Any]] | None]:
-        """The arrays of a single environment.
+    def parts(
+        self, arrays: Sequence[npt.NDArray[Any]], mask: MaskArray | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos in some arrays of these shapes.
+
+        Args:
+            arrays: The arrays.
+            mask: The environments of the infos, shape (N,); None for all.
 
         Returns:
-            The shape and type of each; the form of what they are in; and what takes the observation
-            and the info from there, or None if it is the observation.
+            Observations, which are {} if no program makes any; and infos.
         """
-        if self.form == (0, ()) and len(self.shapes[0][0]) > 1:
-            ((_, *shape), dtype) = self.shapes[0]
-            return ((tuple(shape), dtype),), 0, None
-        return self.shapes, tuple(enumerate(self.form)), _of_one
+        if self.is_plain:
+            return arrays[0], {}
+        tree = self._tree(arrays)
+        infos = tree.get("info", {})
+        told = with_masks(infos, self._everywhere) if mask is None else coded(infos, mask)
+        return tree.get("observation", {}), told
 
-    def _nested(self, leaves: Iterable[Any]) -> tuple[Any, dict[str, Any]]:
-        """Something for each array, in the places of observations and infos."""
-        tree: dict[str, Any] = {"observation": {}, "info": {}}
-        for path, leaf in zip(self._paths, leaves, strict=True):
+    def _tree(self, arrays: Sequence[Any]) -> dict[str, Any]:
+        """Dicts of the arrays by their paths."""
+        tree: dict[str, Any] = {}
+        for path, array in zip(self._paths, arrays, strict=True):
             *parents, name = path
             place = tree
             for parent in parents:
                 place = place.setdefault(parent, {})
-            place[name] = leaf
-        return tree["observation"], tree["info"]
+            place[name] = array
+        return tree
 
 
-def _of_one(tree: dict[int, Any]) -> tuple[Any, Any]:
-    """The observation and the info of a single environment."""
-    return mapped(_first, tree[0]), mapped(_first, tree[1])
+class LayoutOfOne(Layout):
+    """The same of a single environment; a plain array has no axis for environments.
+
+    Args:
+        task, env: See ``Layout``.
+    """
+
+    def __init__(self, task: TaskPrograms, env: FMUEnv) -> None:
+        super().__init__(task, env, 1)
+        self.is_plain = self.is_plain and len(self.shapes[0][0]) > 1
+        if self.is_plain:
+            ((_, *shape), dtype) = self.shapes[0]
+            self.shapes = ((tuple(shape), dtype),)
+
+    def of_one(self, arrays: Sequence[npt.NDArray[Any]]) -> tuple[Any, dict[str, Any]]:
+        """The observation and the info in some arrays of these shapes, if these are not plain."""
+        tree = self._tree(arrays)
+        return mapped(_first, tree.get("observation", {})), mapped(_first, tree.get("info", {}))
 
 
 def _first(array: npt.NDArray[Any]) -> Any:
     """An array without its first axis of one; if it has no other, a number."""
     return array[0].copy() if array.ndim > 1 else array.item()
-
-
-def _pairs(tree: Any) -> Any:
-    """Make tuples of dicts."""
-    if not isinstance(tree, dict):
-        return tree
-    return tuple((name, _pairs(value)) for name, value in tree.items())

@@ -183,7 +183,7 @@ def _play(task: VectorTask, start: Snapshot, places: IndexArray, candidates: Can
         if resting is not None:
             result = _without(result, observations, resting)
         arrays.keep(step, result, resting)
-        observations = result.observations
+        observations = result[0]
     return arrays.rollout()
 
 
@@ -217,18 +217,19 @@ class _Arrays:
         self._has_failed = np.zeros(count, np.bool_)
 
     def keep(self, step: int, result: StepResult, resting: MaskArray | None) -> None:
-        """Copy the result of a step, in which some candidates rest because they have ended."""
+        """Keep the result of a step."""
+        observed, rewards, terminated, truncated, infos = result
         if step == 0:
-            self._observations = mapped(self._room_for, result.observations)
-        if type(result.observations) is np.ndarray:  # no tree to search through
-            self._observations[step] = result.observations
+            self._observations = mapped(self._room_for, observed)
+        if type(observed) is np.ndarray:  # no tree to search through
+            self._observations[step] = observed
         else:
-            mapped(partial(_put, step), self._observations, result.observations)
-        self._rewards[step] = result.rewards
-        self._terminated[step] = result.terminated
-        self._truncated[step] = result.truncated
-        if result.infos:
-            self._keep_infos(step, result.infos, resting)
+            mapped(partial(_put, step), self._observations, observed)
+        self._rewards[step] = rewards
+        self._terminated[step] = terminated
+        self._truncated[step] = truncated
+        if infos:
+            self._keep_infos(step, infos, resting)
 
     def _keep_infos(self, step: int, infos: Mapping[str, Any], resting: MaskArray | None) -> None:
         for name, paid in costs_in(infos, self._has_failed.shape).items():
@@ -257,7 +258,8 @@ def _put(step: int | slice, rows: npt.NDArray[Any], part: npt.NDArray[Any]) -> N
 
 def _without(result: StepResult, before: Any, over: MaskArray) -> StepResult:
     """Leave out the environments whose candidates have ended earlier."""
-    copy_rows(before, result.observations, over)
-    result.rewards[over] = 0.0
-    result.terminated[over] = result.truncated[over] = False
+    observations, rewards, terminated, truncated, _ = result
+    copy_rows(before, observations, over)
+    rewards[over] = 0.0
+    terminated[over] = truncated[over] = False
     return result

@@ -18,7 +18,7 @@ from fmugym.task.saving import READ
 from fmugym.vector.episode_arrays import EpisodeArrays
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.layout import Layout
+from fmugym.vector.layout import LayoutOfOne
 from fmugym.vector.step_form import prepare_step
 from fmugym.vector.views import EpisodeColumn, batched
 
@@ -67,7 +67,7 @@ class ExpressionStep:
             rows.parameters = {name: row for name, row in numbers if name not in draws.strings}
         self._arrays = arrays = EpisodeArrays(env, rows, np.zeros(1, np.bool_))
         arrays.hold(task.variables)
-        shapes, form, self._divided = Layout(task, env, 1).of_one()
+        self._layout = layout = LayoutOfOne(task, env)
         play = prepare_step(
             env,
             arrays,
@@ -75,7 +75,7 @@ class ExpressionStep:
             starts,
             (no_draws(), (), np.zeros((1, 6), np.uint64)),
             env.step_limit,
-            (tuple, form, (), shapes, (None,) * 3),
+            (True, layout.shapes),
         )
         self._play: Any = play.step
         self._updated = task.updated
@@ -99,20 +99,21 @@ class ExpressionStep:
         """
         env._ended = True  # until the step is done: after an exception no episode goes on
         try:
-            result, troubled, ended, _ = self._play(action, False)
+            played = self._play(action, False)
         except _REFUSALS as error:
             require_refusal(error)
-            result, troubled, ended, _ = self._play_element(env, action)
+            played = self._play_element(env, action)
+        troubled, ended, reward, terminated, truncated, seen, _ = played
         if troubled:
             return self._judge_again(env)
         if ended:
             self._arrays.ended[0] = False  # a reset begins the next episode, not the pool
         else:
             env._ended = False
-        seen, reward, terminated, truncated, info = result
-        if self._divided is not None:
-            seen, info = self._divided(seen)
-        return seen, reward, terminated, truncated, info
+        if self._layout.is_plain:
+            return seen[0], reward, terminated, truncated, {}
+        observation, info = self._layout.of_one(seen)
+        return observation, reward, terminated, truncated, info
 
     def _play_element(self, env: FMUEnv, action: Any) -> Any:
         """Do a step with an action that the pool has refused in its own type or shape."""

@@ -33,7 +33,7 @@ def prepare_step(
     starts: FloatArray,
     draws: tuple[Any, Sequence[Draw], npt.NDArray[np.uint64]],
     limit: int,
-    form: tuple[Any, ...],
+    results: tuple[bool, tuple[Any, ...]],
 ) -> Play:
     """Give the pool of an environment everything it needs for steps.
 
@@ -44,12 +44,12 @@ def prepare_step(
         starts: The values of each parameter, a row each.
         draws: What draws values natively, what it draws, and the streams.
         limit: The number of steps after which episodes are truncated.
-        form: How the pool makes results: their type, the forms of observations and infos, the
-            shapes and types of their arrays, and what makes the info of a reset.
+        results: Whether the pool returns numbers of one environment, and the shapes and types of
+            the arrays of observations and infos.
     """
     native, drawn, streams = draws
     count = len(arrays.ended)
-    *kinds, shapes, late = form
+    are_of_one, shapes = results
     flags, real = ((count,), arrays.done.dtype), np.dtype(np.float64)
     judged = ((count,), real), flags, flags, flags
     return env._instance.pool.prepare_play(
@@ -64,7 +64,7 @@ def prepare_step(
             arrays,
             task,
             drawn,
-            (*kinds, (*shapes, *judged, ((len(drawn), count), real)), late),
+            (are_of_one, (*shapes, *judged, ((len(drawn), count), real))),
         ),
     )
 
@@ -104,7 +104,7 @@ def _surroundings(
         arrays: Those of the episodes.
         task: The programs.
         drawn: What the pool draws.
-        results: How it makes results.
+        results: Whether it returns numbers, and the shapes and types of its arrays.
     """
     draws, read = env.episode_start, arrays.quantities
     count = len(arrays.ended)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,14 +25,9 @@ def failed_in(statuses: StatusArray) -> MaskArray:
     return failed
 
 
-class StepResult(NamedTuple):
-    """The result of a step of N environments; no later step changes arrays that somebody holds."""
-
-    observations: Any
-    rewards: FloatArray
-    terminated: MaskArray
-    truncated: MaskArray
-    infos: dict[str, Any]
+StepResult = tuple[Any, FloatArray, MaskArray, MaskArray, dict[str, Any]]
+"""Observations, rewards, terminated, truncated and infos of a step of N environments. No later step
+changes arrays that somebody holds."""
 
 
 class VectorTask(ABC):
@@ -162,14 +157,14 @@ class VectorTask(ABC):
             The same with the first observations of the next episodes; the infos also have the
             last ones, as ``FMUVectorEnv`` tells.
         """
-        ended, told = self.episodes.ended.copy(), result.infos
-        space = self.episodes.prototype.observation_space
-        last = last_observations(space, result.observations, ended)
+        observed, rewards, terminated, truncated, told = result
+        ended, space = self.episodes.ended.copy(), self.episodes.prototype.observation_space
+        last = last_observations(space, observed, ended)
         observations, infos = self.reset(ended)
         infos |= final_infos(last, restricted(told, ended), ended)
         if told:
             infos = merged(restricted(told, ~ended), infos)
-        return result._replace(observations=observations, infos=infos)
+        return observations, rewards, terminated, truncated, infos
 
     # Episodes
 

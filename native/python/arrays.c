@@ -116,34 +116,28 @@ static bool is_free(const Maker *maker, const Made *made) {
 
 /* Providing */
 
-PyObject *maker_make(const Maker *maker, char **memory) {
-    PyArrayObject *array = new_array(maker);
-
-    if (array != NULL) {
-        *memory = PyArray_BYTES(array);
+static void fill(double *numbers, size_t count) {
+    for (size_t i = 0; i < count; i++) {
+        numbers[i] = NAN;
     }
-    return (PyObject *)array;
 }
 
-PyObject *maker_make_blank(const Maker *maker, char **memory) {
-    PyObject *array = maker_make(maker, memory);
-    const int type = array == NULL ? NPY_BOOL : PyArray_TYPE((PyArrayObject *)array);
+static void fill32(float *numbers, size_t count) {
+    for (size_t i = 0; i < count; i++) {
+        numbers[i] = NAN;
+    }
+}
 
-    if (array == NULL) {
-        return NULL;
-    }
+void maker_blank(const Maker *maker, char *memory) {
+    const int type = ((const PyArray_Descr *)(const void *)maker->type)->type_num;
+
     if (type == NPY_DOUBLE) {
-        for (size_t i = 0; i < maker->size / sizeof(double); i++) {
-            ((double *)(void *)*memory)[i] = NAN;
-        }
+        fill((double *)(void *)memory, maker->size / sizeof(double));
     } else if (type == NPY_FLOAT) {
-        for (size_t i = 0; i < maker->size / sizeof(float); i++) {
-            ((float *)(void *)*memory)[i] = NAN;
-        }
+        fill32((float *)(void *)memory, maker->size / sizeof(float));
     } else {
-        memset(*memory, 0, maker->size);
+        memset(memory, 0, maker->size);
     }
-    return array;
 }
 
 PyObject *maker_provide(Maker *maker, char **memory) {
@@ -153,16 +147,17 @@ PyObject *maker_provide(Maker *maker, char **memory) {
             return Py_NewRef(maker->made[k].array);
         }
     }
-    PyObject *array = maker_make(maker, memory);
+    PyArrayObject *array = new_array(maker);
     if (array == NULL) {
         return NULL;
     }
+    *memory = PyArray_BYTES(array);
     Made *place = &maker->made[maker->oldest];
     PyObject *before = place->array;
     maker->oldest = (maker->oldest + 1) % ROUNDS;
-    *place = (Made){.array = Py_NewRef(array), .memory = *memory};
+    *place = (Made){.array = Py_NewRef((PyObject *)array), .memory = *memory};
     Py_XDECREF(before); /* may call back, and another step then replaces the new array */
-    return array;
+    return (PyObject *)array;
 }
 
 /* Copying */

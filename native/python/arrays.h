@@ -38,14 +38,11 @@ void maker_drop(Maker *maker);
  * of the same shapes and types. */
 PyObject *py_copy_arrays(PyObject *module, PyObject *args);
 
-/* Makes an array that the maker keeps no reference of. Returns NULL with an exception if memory runs
- * out. */
-PyObject *maker_make(const Maker *maker, char **memory);
-/* The same for an array of NaN, or of zeros if it holds no floats. */
-PyObject *maker_make_blank(const Maker *maker, char **memory);
 /* Provides an array: a new one, or an earlier one that only the maker still holds. Returns NULL with
  * an exception if memory runs out. */
 PyObject *maker_provide(Maker *maker, char **memory);
+/* Fills the memory of an array with NaN, or with zeros if it holds no floats. */
+void maker_blank(const Maker *maker, char *memory);
 
 /* Whether an object is an array of this shape, type and strides with memory of its own, as numpy has
  * made it: nobody has changed it in place, or refers to it weakly. If so, sets its memory. */

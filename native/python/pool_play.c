@@ -140,23 +140,12 @@ static void settle_starts_at_ends(const Playing *playing, const ResultArrays *ar
     }
 }
 
-/* The result, how many instances had trouble, whether any episode is at its end now, and None or
- * where episodes have started. */
 static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
     const bool at_ends = t->turn.started != NULL;
     const bool any_started = at_ends ? t->ends.started > 0 : t->turn.drawn != NULL;
-    PyObject *result = results_of_step(playing->results, arrays, any_started, at_ends);
-    PyObject *tuple = result == NULL ? NULL : PyTuple_New(4);
 
-    if (tuple == NULL) {
-        Py_XDECREF(result);
-        return NULL;
-    }
-    PyTuple_SetItem(tuple, 0, result);
-    PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
-    PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended > t->ends.started));
-    PyTuple_SetItem(tuple, 3, Py_NewRef(any_started ? arrays->arrays[MASK_ARRAY] : Py_None));
-    return tuple;
+    return results_of_step(playing->results, arrays, t->troubled, t->ends.ended > t->ends.started,
+                           any_started, at_ends);
 }
 
 static void raise_bad_action(void) {

@@ -40,21 +40,6 @@ static void settle_reset(PyPool *self, const Playing *playing, const ResultArray
     }
 }
 
-static PyObject *reset_result(const Playing *playing, const ResultArrays *arrays,
-                              const PyTurn *t) {
-    PyObject *result = results_of_reset(playing->results, arrays);
-    PyObject *tuple = result == NULL ? NULL : PyTuple_New(3);
-
-    if (tuple == NULL) {
-        Py_XDECREF(result);
-        return NULL;
-    }
-    PyTuple_SetItem(tuple, 0, result);
-    PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
-    PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended != 0));
-    return tuple;
-}
-
 /* The memory is provided first: that may run code that changes the caller's mask. */
 static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
     const Playing *playing = playing_of(capsule);
@@ -68,7 +53,8 @@ static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
         } else {
             settle_reset(self, playing, &arrays, &t);
             if (perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self)) {
-                result = reset_result(playing, &arrays, &t);
+                result = results_of_reset(playing->results, &arrays, t.troubled,
+                                          t.ends.ended != 0);
             }
         }
     }

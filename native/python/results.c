@@ -1,41 +1,17 @@
-/* The results of a step or a reset: arrays, tuples and dicts. */
+/* The arrays of a step or a reset: taken over once, provided for each call, and returned in tuples. */
 
 #include "results.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "infos.h"
+#include "arrays.h"
 
 struct Results {
-    PyObject *parts;
-    PyTypeObject *class;
-    allocfunc allocate;
-    PyObject *late, *unfilled, *tell; /* what infos tell of the episodes that start: see LateDict */
+    bool are_of_one;
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
-    Form observations, infos;
 };
-
-enum { DRAWN, MASK_OF_DRAWN, FINAL_OBS, MASK_OF_FINAL_OBS, FINAL_INFO, MASK_OF_FINAL_INFO, NAMES };
-
-static PyObject *names[NAMES]; /* of this process: other interpreters cannot load this extension */
-
-/* Making a name takes as long as setting an item. */
-static bool know_names(void) {
-    static const char *const texts[NAMES] = {"drawn",      "_drawn",     "final_obs",
-                                             "_final_obs", "final_info", "_final_info"};
-
-    for (int i = 0; i < NAMES; i++) {
-        if (names[i] == NULL) {
-            names[i] = PyUnicode_InternFromString(texts[i]);
-        }
-        if (names[i] == NULL) {
-            return false;
-        }
-    }
-    return true;
-}
 
 /* Taking over */
 
@@ -58,46 +34,20 @@ static bool take_makers(Results *r, PyObject *shapes) {
     return true;
 }
 
-static bool take_forms(Results *r, PyObject *observations, PyObject *infos) {
-    if (!form_take(&r->observations, observations, r->number_of_seen) ||
-        !form_take(&r->infos, infos, r->number_of_seen)) {
-        return false;
-    }
-    if (r->infos.is_array) {
-        PyErr_SetString(PyExc_TypeError, "infos are no array");
-    }
-    return !r->infos.is_array;
-}
-
-static bool take_class(Results *r) {
-    r->allocate = (allocfunc)PyType_GetSlot(r->class, Py_tp_alloc);
-    if (r->allocate == NULL || !PyType_IsSubtype(r->class, &PyTuple_Type)) {
-        PyErr_SetString(PyExc_TypeError, "results must be tuples");
-        return false;
-    }
-    return true;
-}
-
-static bool take_parts(Results *r, PyObject *parts) {
-    PyObject *observations, *infos, *shapes;
-
-    return PyArg_ParseTuple(parts, "O!OOO!(OOO);results", &PyType_Type, &r->class, &observations,
-                            &infos, &PyTuple_Type, &shapes, &r->late, &r->unfilled, &r->tell) &&
-           know_names() && take_class(r) && numpy_import() && take_makers(r, shapes) &&
-           take_forms(r, observations, infos);
-}
-
 Results *results_take(PyObject *parts) {
+    int are_of_one;
+    PyObject *shapes;
     Results *r = calloc(1, sizeof *r);
 
     if (r == NULL) {
         PyErr_NoMemory();
         return NULL;
     }
-    r->parts = Py_NewRef(parts); /* keeps the rest alive */
     if (!PyTuple_Check(parts)) {
         PyErr_SetString(PyExc_TypeError, "expected a tuple of results");
-    } else if (take_parts(r, parts)) {
+    } else if (PyArg_ParseTuple(parts, "pO!;results", &are_of_one, &PyTuple_Type, &shapes) &&
+               numpy_import() && take_makers(r, shapes)) {
+        r->are_of_one = are_of_one != 0;
         return r;
     }
     results_free(r);
@@ -108,20 +58,17 @@ void results_free(Results *r) {
     if (r == NULL) {
         return;
     }
-    form_drop(&r->observations);
-    form_drop(&r->infos);
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
         maker_drop(&r->makers[i]);
     }
     for (size_t i = 0; i < r->number_of_seen; i++) {
         maker_drop(&r->last[i]);
     }
-    Py_XDECREF(r->parts);
     free(r);
 }
 
 bool results_are_of_one(const Results *r) {
-    return r->late == Py_None;
+    return r->are_of_one;
 }
 
 size_t results_number_of_seen(const Results *r) {
@@ -163,6 +110,7 @@ static bool provide_last(Results *r, ResultArrays *a) {
         if (a->last[i] == NULL) {
             return false;
         }
+        maker_blank(&r->last[i], a->last_memory[i]);
     }
     return true;
 }
@@ -200,63 +148,18 @@ bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) 
 
 /* Returning */
 
-/* A dict that calls the function when it is read, which is rare. */
-static PyObject *told_late(const Results *r, const ResultArrays *a) {
-    PyObject *late = PyObject_CallNoArgs(r->late);
-    PyObject *call = PyTuple_Pack(3, r->tell, a->arrays[DRAWN_ARRAY], a->arrays[MASK_ARRAY]);
+static PyObject *seen_of(const Results *r, PyObject *const *arrays) {
+    PyObject *seen = PyTuple_New((Py_ssize_t)r->number_of_seen);
 
-    if (late != NULL && !set_item(late, r->unfilled, Py_XNewRef(call))) {
-        Py_CLEAR(late);
+    for (size_t i = 0; i < r->number_of_seen && seen != NULL; i++) {
+        PyTuple_SetItem(seen, (Py_ssize_t)i, Py_NewRef(arrays[i]));
     }
-    Py_XDECREF(call);
-    return late;
-}
-
-static bool add_starts(const Results *r, PyObject *infos, const ResultArrays *a) {
-    return set_item(infos, names[DRAWN], told_late(r, a)) &&
-           set_item(infos, names[MASK_OF_DRAWN], Py_NewRef(a->arrays[MASK_ARRAY]));
-}
-
-static Origin origin_of(const Results *r, const ResultArrays *a) {
-    return (Origin){r->makers, &r->makers[MASK_ARRAY], a->arrays, a->memory, NULL};
-}
-
-static PyObject *infos_within(const Origin *origin, const Form *form) {
-    PyObject *infos = PyDict_New();
-
-    if (infos != NULL && !infos_add(origin, form, infos)) {
-        Py_CLEAR(infos);
-    }
-    return infos;
-}
-
-static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
-    const char *mask = a->memory[MASK_ARRAY];
-    Origin origin = origin_of(r, a);
-
-    origin.memory = a->last_memory;
-    origin.mask = mask;
-    return set_item(infos, names[FINAL_OBS], infos_observations(&origin, &r->observations)) &&
-           set_item(infos, names[MASK_OF_FINAL_OBS], infos_mask(&origin)) &&
-           set_item(infos, names[FINAL_INFO], infos_within(&origin, &r->infos)) &&
-           set_item(infos, names[MASK_OF_FINAL_INFO], infos_mask(&origin));
-}
-
-static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started,
-                               bool at_ends) {
-    const Origin origin = origin_of(r, a);
-    PyObject *infos = infos_within(&origin, &r->infos);
-
-    if (infos != NULL && any_started &&
-        (!add_starts(r, infos, a) || (at_ends && !add_ends(r, infos, a)))) {
-        Py_CLEAR(infos);
-    }
-    return infos;
+    return seen;
 }
 
 /* The rewards, or where episodes have ended; of a single environment a number. */
 static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t array) {
-    if (!results_are_of_one(r)) {
+    if (!r->are_of_one) {
         return Py_NewRef(a->arrays[array]);
     }
     const char *memory = a->memory[array];
@@ -264,42 +167,53 @@ static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t array
                                   : PyBool_FromLong(*memory);
 }
 
-/* Makes the tuple without the constructor of its class, which takes several times as long. */
-PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started, bool at_ends) {
-    PyObject *observations = form_of(&r->observations, a->arrays);
-    PyObject *infos = observations == NULL ? NULL : infos_of_step(r, a, any_started, at_ends);
-    PyObject *result = infos == NULL ? NULL : r->allocate(r->class, 5);
+static PyObject *tuple_of(PyObject *const *parts, Py_ssize_t count) {
+    PyObject *tuple = PyTuple_New(count);
+    bool good = tuple != NULL;
 
-    if (result == NULL) {
-        Py_XDECREF(observations);
-        Py_XDECREF(infos);
-        return NULL;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        good = good && parts[i] != NULL;
+        if (tuple == NULL) {
+            Py_XDECREF(parts[i]);
+        } else {
+            PyTuple_SetItem(tuple, i, parts[i]);
+        }
     }
-    PyTuple_SetItem(result, 0, observations);
-    for (Py_ssize_t i = 0; i < 3; i++) {
-        PyTuple_SetItem(result, 1 + i, judged_of(r, a, REWARDS_ARRAY + (size_t)i));
+    if (!good) {
+        Py_CLEAR(tuple);
     }
-    PyTuple_SetItem(result, 4, infos);
-    return result;
+    return tuple;
 }
 
-static PyObject *infos_of_reset(Results *r, const ResultArrays *a) {
-    Origin origin = origin_of(r, a);
-
-    origin.mask = a->memory[MASK_ARRAY];
-    PyObject *infos = infos_within(&origin, &r->infos);
-    if (infos != NULL && !add_starts(r, infos, a)) {
-        Py_CLEAR(infos);
-    }
-    return infos;
+static PyObject *starts_of(const Results *r, const ResultArrays *a, bool at_ends) {
+    PyObject *const parts[] = {
+        Py_NewRef(a->arrays[MASK_ARRAY]),
+        Py_NewRef(a->arrays[DRAWN_ARRAY]),
+        at_ends ? seen_of(r, a->last) : Py_NewRef(Py_None),
+    };
+    return tuple_of(parts, sizeof parts / sizeof *parts);
 }
 
-PyObject *results_of_reset(Results *r, const ResultArrays *a) {
-    PyObject *infos = infos_of_reset(r, a);
-    PyObject *observations = infos == NULL ? NULL : form_of(&r->observations, a->arrays);
-    PyObject *result = observations == NULL ? NULL : PyTuple_Pack(2, observations, infos);
+PyObject *results_of_step(const Results *r, const ResultArrays *a, size_t troubled, bool any_ended,
+                          bool any_started, bool at_ends) {
+    PyObject *const parts[] = {
+        PyLong_FromSize_t(troubled),
+        PyBool_FromLong(any_ended),
+        judged_of(r, a, REWARDS_ARRAY),
+        judged_of(r, a, TERMINATED_ARRAY),
+        judged_of(r, a, TRUNCATED_ARRAY),
+        seen_of(r, a->arrays),
+        any_started ? starts_of(r, a, at_ends) : Py_NewRef(Py_None),
+    };
+    return tuple_of(parts, sizeof parts / sizeof *parts);
+}
 
-    Py_XDECREF(observations);
-    Py_XDECREF(infos);
-    return result;
+PyObject *results_of_reset(const Results *r, const ResultArrays *a, size_t troubled,
+                           bool any_ended) {
+    PyObject *const parts[] = {
+        PyLong_FromSize_t(troubled),         PyBool_FromLong(any_ended),
+        seen_of(r, a->arrays),               Py_NewRef(a->arrays[MASK_ARRAY]),
+        Py_NewRef(a->arrays[DRAWN_ARRAY]),
+    };
+    return tuple_of(parts, sizeof parts / sizeof *parts);
 }

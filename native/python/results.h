@@ -1,4 +1,4 @@
-/* The arrays that a step or a reset returns, and the tuple and the dicts that they are in. */
+/* The arrays that a step or a reset returns. */
 
 #ifndef FMUGYM_RESULTS_H
 #define FMUGYM_RESULTS_H
@@ -24,12 +24,9 @@ typedef struct {
     char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
 } ResultArrays;
 
-/* Takes a tuple: the class of a step's result; the forms of observations and of infos (see forms.h);
- * the shape and type of each array: those of observations and infos, then rewards, terminated,
- * truncated, mask and drawn values; and, for what infos tell of the episodes that start, the class
- * LateDict, the key of what fills it, and a function of drawn values and a mask that does so. None in
- * the place of these three makes results of a single environment: numbers for arrays of one. Returns
- * NULL with an exception if it does not fit. */
+/* Takes a tuple: whether results are those of a single environment, with numbers in the place of arrays
+ * of one; and the shape and type of each array: those of observations and infos, then rewards,
+ * terminated, truncated, mask and drawn values. Returns NULL with an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 
@@ -45,7 +42,7 @@ size_t results_size(const Results *results, size_t array);
 bool results_provide_step(Results *results, ResultArrays *arrays);
 bool results_provide_reset(Results *results, ResultArrays *arrays);
 /* Provides, after results_provide_step, what it takes besides if episodes start; and if they do so
- * where others end. */
+ * where others end, for which arrays are blank. */
 bool results_provide_starts(Results *results, bool at_ends, ResultArrays *arrays);
 void results_drop(const Results *results, ResultArrays *arrays);
 
@@ -53,11 +50,15 @@ void results_drop(const Results *results, ResultArrays *arrays);
  * with, or has no true element. */
 bool results_copy_mask(const Results *results, PyObject *mask, const ResultArrays *arrays);
 
-/* Returns the result of a step. If episodes have started where others have ended, the infos are those
- * of Gymnasium's mode SAME_STEP. */
-PyObject *results_of_step(Results *results, const ResultArrays *arrays, bool any_started,
-                          bool at_ends);
-/* Returns the observations and infos of a reset. */
-PyObject *results_of_reset(Results *results, const ResultArrays *arrays);
+/* Returns a tuple: how many environments had trouble; whether any episode is at its end now; rewards,
+ * terminated and truncated; the arrays of observations and infos, a tuple; and None, or a tuple of where
+ * episodes have started, what they have drawn, and None, or the last observations and infos where
+ * episodes have ended in this step, in arrays of NaN, or of zeros. */
+PyObject *results_of_step(const Results *results, const ResultArrays *arrays, size_t troubled,
+                          bool any_ended, bool any_started, bool at_ends);
+/* Returns a tuple: how many environments had trouble; whether any episode is at its end now; the arrays
+ * of observations and infos; where episodes have started, and what they have drawn. */
+PyObject *results_of_reset(const Results *results, const ResultArrays *arrays, size_t troubled,
+                           bool any_ended);
 
 #endif

@@ -80,8 +80,8 @@ def test_a_pendulum_with_a_motor(example, task, seed):
             assert reward == pytest.approx(rewards[step], abs=10 * tolerance)
             assert (terminated, truncated) == (ends[step], False)
             many = envs.step(np.full((2, 1), action))
-            assert many.rewards.tolist() == [reward] * 2
-            assert many.terminated.tolist() == [terminated] * 2
+            assert many[1].tolist() == [reward] * 2
+            assert many[2].tolist() == [terminated] * 2
 
 
 def test_a_system(example, tmp_path):

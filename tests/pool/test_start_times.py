@@ -215,9 +215,9 @@ def test_snapshots_and_rollouts_keep_it(sun, way, interface, version):
     envs.restore_state(snapshot, 1)
     for observation, reward in expected:
         result = envs.step(np.zeros((2, 1), np.float32))
-        assert result.observations[1].tolist() == observation.tolist()
-        assert result.rewards[1] == reward
-        assert result.observations[0][0] != observation[0]
+        assert result[0][1].tolist() == observation.tolist()
+        assert result[1][1] == reward
+        assert result[0][0][0] != observation[0]
     env.close()
     envs.close()
 

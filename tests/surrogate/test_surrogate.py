@@ -235,8 +235,8 @@ class TestStates:
                     envs.restore_state(saved)
                     for seen, rewards in expected:
                         result = envs.step(action)
-                        assert np.array_equal(result.observations, seen[[2, 2, 2]])
-                        assert np.array_equal(result.rewards, rewards[[2, 2, 2]])
+                        assert np.array_equal(result[0], seen[[2, 2, 2]])
+                        assert np.array_equal(result[1], rewards[[2, 2, 2]])
 
     def test_states_of_the_fmu_and_of_the_surrogate_are_told_apart(self, pendulum):
         with (

@@ -209,8 +209,8 @@ class TestVector:
         expected = envs.step(actions)
         envs.restore_state(snapshot)
         again = envs.step(actions)
-        assert again.observations.tolist() == expected.observations.tolist()
-        assert again.rewards.tolist() == [0.0, 0.0]
+        assert again[0].tolist() == expected[0].tolist()
+        assert again[1].tolist() == [0.0, 0.0]
 
     @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_parameters_from_options_are_restored(self, hooks, vector_of):
@@ -239,11 +239,11 @@ class TestVector:
         actions = np.zeros(envs.action_space.shape, envs.action_space.dtype)
         first = envs.step(actions)
         snapshot = envs.save_state()
-        while not envs.step(actions).truncated.any():
+        while not envs.step(actions)[3].any():
             pass
         observations = envs.restore_state(snapshot)
-        assert observations.tolist() == first.observations.tolist()
-        assert not envs.step(actions).truncated.any()
+        assert observations.tolist() == first[0].tolist()
+        assert not envs.step(actions)[3].any()
 
 
 class TestValues:

@@ -180,10 +180,10 @@ class Subject:
         actions = self.rng.integers(0, 2, self.n)
         at_ends = bool(self.rng.random() < 0.5)  # episodes start in the step that ends others
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            result = self.pool._pool.play(actions, at_ends)[0]
+            *_, starts = self.pool._pool.play(actions, at_ends)
             counts["played"] += 1
             if self.rng.random() < 0.5:
-                self.ends = result[4].get("final_obs")
+                self.starts = starts
 
     def reset_by(self):
         """Hold what some resets return, and read it later."""
@@ -191,7 +191,7 @@ class Subject:
             result = self.pool._pool.reset_by({"reset_mask": self.mask()})
             if result is not None and self.rng.random() < 0.5:
                 self.held = result
-                assert self.held[0][1]["drawn"]["drawn"].shape == (1, self.n)
+                assert self.held[-1].shape == (1, self.n)
 
     def save(self):
         self.snapshot = self.pool.save()

@@ -5,7 +5,6 @@ import numpy as np
 from fmugym import _native
 from fmugym.expressions.program import CONSTANT, OPERATIONS
 from fmugym.pool.form import form_of_draws
-from fmugym.task.values import UNFILLED, LateDict
 
 DISCRETE = {
     "shape": (),
@@ -44,9 +43,6 @@ def results_of(count, observed, draws):
     """The form of what a step returns: a tuple, with so many observed outputs and draws."""
     flags, seen = ((count,), bool), ((count, observed), np.float32)
     arrays = seen, ((count,), float), flags, flags, flags, ((draws, count), float)
-    return tuple, 0, (), arrays, (LateDict, UNFILLED, _tell)
+    return False, arrays
 
 
-def _tell(drawn, mask):
-    """What infos tell of the episodes that start."""
-    return {"drawn": drawn * mask}
