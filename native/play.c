@@ -141,32 +141,19 @@ static void forget_actions(const Actions *a, size_t index) {
     }
 }
 
-static void start_inputs(const Play *play, const uint32_t *starting, size_t count) {
-    for (size_t i = 0; i < play->number_of_inputs; i++) {
-        const InputStart *start = &play->input_starts[i];
-        double *row = play->input_rows + i * play->count;
-        for (size_t j = 0; j < count; j++) {
-            row[starting[j]] = start->row == NULL ? start->value : start->row[starting[j]];
-        }
+static void start_row(const RowStart *start, const char *from, const uint32_t *starting,
+                      size_t count) {
+    const size_t size = start->to.size;
+
+    for (size_t j = 0; j < count; j++) {
+        const size_t place = starting[j] * size;
+        memcpy(start->to.data + place, from + place, size);
     }
 }
 
-static void start_variables(const Turn *turn, const uint32_t *starting, size_t count) {
-    const Play *play = turn->play;
-
-    for (size_t i = 0; i < play->number_of_variable_starts; i++) {
-        const VariableStart *start = &play->variable_starts[i];
-        for (size_t j = 0; j < count; j++) {
-            memcpy(start->row.data + starting[j] * start->row.size, &start->bits, start->row.size);
-        }
-    }
-    for (size_t i = 0; turn->drawn != NULL && i < play->number_of_drawn_variables; i++) {
-        const DrawnVariable *variable = &play->drawn_variables[i];
-        const double *values = turn->drawn + variable->draw * play->count;
-        for (size_t j = 0; j < count; j++) {
-            memcpy(variable->row.data + starting[j] * sizeof *values, &values[starting[j]],
-                   sizeof *values);
-        }
+static void start_constant(const RowStart *start, const uint32_t *starting, size_t count) {
+    for (size_t j = 0; j < count; j++) {
+        memcpy(start->to.data + starting[j] * start->to.size, &start->from.bits, start->to.size);
     }
 }
 
@@ -176,20 +163,16 @@ static void start_listed(const Turn *turn, const uint32_t *starting, size_t coun
 
     for (size_t j = 0; j < count; j++) {
         forget_actions(&play->actions, starting[j]);
-        if (play->done != NULL) {
-            play->done[starting[j]] = 0;
-        }
     }
-    start_inputs(play, starting, count);
-    start_variables(turn, starting, count);
-    for (size_t j = 0; j < count; j++) {
-        copy_rows(&play->before_inputs, starting[j], 1);
-    }
-    for (size_t i = 0; i < play->number_of_outputs; i++) {
-        const double *from = play->output_rows + i * play->count;
-        double *to = play->kept_rows + i * play->count;
-        for (size_t j = 0; j < count; j++) {
-            to[starting[j]] = from[starting[j]];
+    for (size_t i = 0; i < play->number_of_starts; i++) {
+        const RowStart *start = &play->starts[i];
+        if (start->kind == START_CONSTANT) {
+            start_constant(start, starting, count);
+        } else if (start->kind == START_ROW) {
+            start_row(start, start->from.row, starting, count);
+        } else if (turn->drawn != NULL) {
+            const double *values = turn->drawn + start->from.draw * play->count;
+            start_row(start, (const char *)values, starting, count);
         }
     }
 }

@@ -27,12 +27,6 @@ typedef struct {
     const char *none;         /* what counts as the action of an episode that starts */
 } Actions;
 
-/* The value of an input that the hooks read at the start of an episode. */
-typedef struct {
-    const double *row; /* NULL stands for the same value everywhere */
-    double value;
-} InputStart;
-
 /* Keeps a row as it was before the step. */
 typedef struct {
     Row from, to;
@@ -43,17 +37,18 @@ typedef struct {
     size_t count;
 } RowCopies;
 
-/* The value of an episode variable at the start of an episode, unless it is drawn. */
-typedef struct {
-    Row row;
-    uint64_t bits; /* the value in its first bytes */
-} VariableStart;
+/* What a row holds at the start of an episode. */
+typedef enum { START_CONSTANT, START_ROW, START_DRAW } StartKind;
 
-/* An episode variable that is drawn, and the number of its draw. */
 typedef struct {
-    Row row;
-    size_t draw;
-} DrawnVariable;
+    Row to;
+    StartKind kind;
+    union {
+        uint64_t bits;    /* of a constant, in the first bytes */
+        const char *row;  /* of values of the same size */
+        size_t draw;      /* the number of a draw */
+    } from;
+} RowStart;
 
 /* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
@@ -62,19 +57,14 @@ typedef struct {
     Program judgement; /* stores the rest; its results are done, truncated, reward */
     Source source;     /* only the statuses; each step sets the rest */
     Actions actions;
-    double *input_rows;
-    const InputStart *input_starts;
-    size_t number_of_inputs;
     const double *output_rows;
     double *kept_rows; /* the outputs before the step */
     size_t number_of_outputs;
     bool reads_kept; /* whether the judgement reads them */
     RowCopies before_inputs;    /* what the program of the inputs is going to replace */
     RowCopies before_judgement; /* the episode variables */
-    const VariableStart *variable_starts;
-    size_t number_of_variable_starts;
-    const DrawnVariable *drawn_variables;
-    size_t number_of_drawn_variables;
+    const RowStart *starts; /* in their order */
+    size_t number_of_starts;
     double *start_values; /* a row for each start variable */
     size_t number_of_parameters;
     const Draws *draws;
@@ -133,8 +123,7 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 /* Keeps so many outputs of a run, from the first of them on, before the new ones replace them. */
 void play_keep_outputs(const Play *play, size_t first, size_t number, size_t begin, size_t count);
 
-/* Sets what hooks read at the start of an episode: actions, inputs, episode variables, and the
- * outputs before the step. */
+/* Sets what programs and hooks read at the start of an episode: actions, and the rows of starts. */
 void play_start_episode(const Turn *turn, size_t index);
 
 /* Writes the results of an environment that is neither reset nor stepped, because memory ran

@@ -59,52 +59,40 @@ static RowCopies read_copies(Reader *reader, RowCopy **memory, const Rows *rows)
     return (RowCopies){copies, count};
 }
 
-/* A row and the bits of a value. */
-static void read_variable_starts(Reader *reader, PlayForm *p, const Rows *rows) {
-    size_t count;
-    const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
+static RowStart read_start(Reader *reader, const Play *play, const Rows *rows,
+                           const int64_t *numbers) {
+    RowStart start = {.to = row_of(reader, rows, numbers[0]), .kind = START_CONSTANT};
+    const size_t draws = play->draws == NULL ? 0 : play->draws->count;
+    bool fits = true;
 
-    p->variable_starts = room_for(reader, count, sizeof *p->variable_starts);
-    p->play.variable_starts = p->variable_starts;
-    p->play.number_of_variable_starts = count;
-    for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
-        p->variable_starts[i] = (VariableStart){row_of(reader, rows, pairs[0]), (uint64_t)pairs[1]};
+    if (numbers[1] == START_CONSTANT) {
+        start.from.bits = (uint64_t)numbers[2];
+    } else if (numbers[1] == START_ROW) {
+        const Row from = row_of(reader, rows, numbers[2]);
+        start.kind = START_ROW;
+        start.from.row = from.data;
+        fits = from.size == start.to.size;
+    } else {
+        start.kind = START_DRAW;
+        start.from.draw = (size_t)numbers[2];
+        fits = start.to.size == sizeof(double) && (uint64_t)numbers[2] < draws;
     }
+    if (!fits) {
+        reader_refuse(reader, "a row and its start differ in type, or there is no such draw");
+    }
+    return start;
 }
 
-static void read_drawn_variables(Reader *reader, PlayForm *p, const Rows *rows) {
-    const size_t draws = p->play.draws == NULL ? 0 : p->play.draws->count;
+/* For each a row, a kind, and a number: bits of a constant, a row or a draw. */
+static void read_starts(Reader *reader, PlayForm *p, const Rows *rows) {
     size_t count;
-    const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
+    const int64_t *numbers = read_array(reader, 3 * sizeof *numbers, &count);
 
-    p->drawn_variables = room_for(reader, count, sizeof *p->drawn_variables);
-    p->play.drawn_variables = p->drawn_variables;
-    p->play.number_of_drawn_variables = count;
-    for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
-        p->drawn_variables[i] = (DrawnVariable){row_of(reader, rows, pairs[0]), (size_t)pairs[1]};
-        if (p->drawn_variables[i].row.size != sizeof(double) || (uint64_t)pairs[1] >= draws) {
-            reader_refuse(reader, "a drawn variable is no float64, or has no draw");
-        }
-    }
-}
-
-/* Each input starts with the value of a parameter or, if its number is negative, a constant. */
-static void read_input_starts(Reader *reader, PlayForm *p) {
-    Play *play = &p->play;
-    size_t count, constants;
-    const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
-    const double *values = read_array(reader, sizeof *values, &constants);
-
-    play->input_starts = p->input_starts = room_for(reader, count, sizeof *p->input_starts);
-    play->number_of_inputs = count;
-    if (constants != count) {
-        reader_refuse(reader, "the inputs differ in number");
-    }
+    p->starts = room_for(reader, count, sizeof *p->starts);
+    p->play.starts = p->starts;
+    p->play.number_of_starts = count;
     for (size_t i = 0; i < count && reader->fault == NULL; i++) {
-        p->input_starts[i].value = values[i];
-        if (numbers[i] >= 0 && (uint64_t)numbers[i] < play->number_of_parameters) {
-            p->input_starts[i].row = play->start_values + (size_t)numbers[i] * play->count;
-        }
+        p->starts[i] = read_start(reader, &p->play, rows, numbers + 3 * i);
     }
 }
 
@@ -142,13 +130,10 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
     read_actions(&reader, p);
     p->play.before_inputs = read_copies(&reader, &p->before_inputs, &all);
     p->play.before_judgement = read_copies(&reader, &p->before_judgement, &all);
-    read_variable_starts(&reader, p, &all);
-    read_drawn_variables(&reader, p, &all);
-    read_input_starts(&reader, p);
+    read_starts(&reader, p, &all);
     read_program(&reader, p, &p->inputs, &all);
     read_program(&reader, p, &p->judgement, &all);
-    if (reader.at != reader.end || p->play.number_of_inputs != s->inputs->count ||
-        p->inputs.program.number_of_seen > 0 ||
+    if (reader.at != reader.end || p->inputs.program.number_of_seen > 0 ||
         p->judgement.program.number_of_results != PROGRAM_RESULTS) {
         reader_refuse(&reader, "a program does not fit the pool");
     }
@@ -167,15 +152,14 @@ static void note_outputs(ProgramForm *p, const Settings *s) {
     }
 }
 
-void play_settle(PlayForm *p, const Settings *s, double *inputs, double *kept,
-                 int64_t *step_counts, uint8_t *ended) {
+void play_settle(PlayForm *p, const Settings *s, double *kept, int64_t *step_counts,
+                 uint8_t *ended) {
     Play *play = &p->play;
 
     note_outputs(&p->judgement, s);
     play->inputs = p->inputs.program;
     play->judgement = p->judgement.program;
     play->source.statuses = s->status;
-    play->input_rows = inputs;
     play->output_rows = s->output_values;
     play->number_of_outputs = s->outputs->count;
     play->kept_rows = kept;
@@ -188,8 +172,6 @@ void play_drop(PlayForm *p) {
     program_drop(&p->judgement);
     free(p->before_inputs);
     free(p->before_judgement);
-    free(p->variable_starts);
-    free(p->drawn_variables);
-    free(p->input_starts);
+    free(p->starts);
     free(p->form);
 }

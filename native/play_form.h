@@ -12,9 +12,7 @@ typedef struct {
     bool keeps_actions; /* whether hooks read the actions of this step or of the one before */
     char *form;         /* a copy of it, which the play points to */
     RowCopy *before_inputs, *before_judgement;
-    VariableStart *variable_starts;
-    DrawnVariable *drawn_variables;
-    InputStart *input_starts;
+    RowStart *starts;
 } PlayForm;
 
 /* Reads the form of a play, which names rows by their numbers among these. The caller has set the start
@@ -22,10 +20,10 @@ typedef struct {
  * must drop the play in any case. */
 const char *play_take(PlayForm *p, const Settings *settings, const void *form, size_t size,
                       const Row *rows, size_t number_of_rows);
-/* Lets a play use the outputs and statuses of a pool, and memory of its owner: the inputs, the outputs
- * before a step, the steps of each episode, and which of them have ended. */
-void play_settle(PlayForm *p, const Settings *settings, double *inputs, double *kept,
-                 int64_t *step_counts, uint8_t *ended);
+/* Lets a play use the outputs and statuses of a pool, and memory of its owner: the outputs before a
+ * step, the steps of each episode, and which of them have ended. */
+void play_settle(PlayForm *p, const Settings *settings, double *kept, int64_t *step_counts,
+                 uint8_t *ended);
 void play_drop(PlayForm *p);
 
 #endif

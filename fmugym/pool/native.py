@@ -309,9 +309,8 @@ def prepare(
         surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether the second
             program reads them; ``done``, for where the latest step has ended the task, shape (N,),
             or None; ``before_inputs`` and ``before_judgement``, pairs of rows: values, and where
-            they are kept before a program replaces them; ``drawn_variables``, rows and the numbers
-            of their draws; ``variable_starts``, rows and the bytes of their constants;
-            ``input_starts``, for each input the number of a start value, or -1 and a constant.
+            they are kept before a program replaces them; ``starts``, pairs of rows and what they
+            hold at the start of an episode, in this order, see ``fmugym.pool.play_form.Start``.
             ``results``, whether to return numbers in the place of arrays of one; and the shape and
             type of each array: float32 observations, or those that the second program stores, then
             rewards, terminated and truncated of a step, mask and drawn values (draws, N) of a

@@ -11,9 +11,12 @@ import numpy.typing as npt
 
 from fmugym.pool.form import Writer
 
-__all__ = ["Rows", "form_of_play"]
+__all__ = ["Rows", "Start", "form_of_play"]
 
 _Row = npt.NDArray[Any]
+
+Start = bytes | _Row | int
+"""The start of a row: the bytes of a constant, the values of another row, or a draw's number."""
 
 
 class Rows:
@@ -64,14 +67,18 @@ def form_of_play(
     for moment in ("before_inputs", "before_judgement"):
         pairs = surroundings[moment]
         writer.array([[number(source), number(to)] for source, to in pairs], np.int64)
-    starts = surroundings["variable_starts"]
-    writer.array([(number(row), _bits_of(value)) for row, value in starts], np.int64)
-    writer.array([(number(row), draw) for row, draw in surroundings["drawn_variables"]], np.int64)
-    writer.array([parameter for parameter, _ in surroundings["input_starts"]], np.int64)
-    writer.array([value for _, value in surroundings["input_starts"]], np.float64)
+    starts = surroundings["starts"]
+    writer.array([(number(row), *_start_of(rows, source)) for row, source in starts], np.int64)
     for form, own in programs:
         writer.block(form).array(list(map(number, own)), np.int64)
     return writer.form()
+
+
+def _start_of(rows: Rows, source: Start) -> tuple[int, int]:
+    """The kind of a start, a ``StartKind`` of ``native/play.h``, and its number."""
+    if isinstance(source, bytes):
+        return 0, _bits_of(source)
+    return (2, source) if isinstance(source, int) else (1, rows.number(source))
 
 
 def _bits_of(value: bytes) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.expressions.program import LETTERS
 from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.base import FloatArray, Play
+from fmugym.pool.play_form import Start
 from fmugym.task.episode_start import Draw
 from fmugym.vector.episode_arrays import EpisodeArrays, element_row
 from fmugym.vector.hooks.task_programs import TaskPrograms
@@ -63,6 +64,7 @@ def prepare_step(
             env,
             arrays,
             task,
+            starts,
             drawn,
             (are_of_one, (*shapes, *judged, ((len(drawn), count), real))),
         ),
@@ -94,6 +96,7 @@ def _surroundings(
     env: FMUEnv,
     arrays: EpisodeArrays,
     task: TaskPrograms,
+    start_values: FloatArray,
     drawn: Sequence[Draw],
     results: tuple[Any, ...],
 ) -> dict[str, Any]:
@@ -103,47 +106,55 @@ def _surroundings(
         env: The environment.
         arrays: Those of the episodes.
         task: The programs.
+        start_values: The values of each parameter, a row each.
         drawn: What the pool draws.
         results: Whether it returns numbers, and the shapes and types of its arrays.
     """
-    draws, read = env.episode_start, arrays.quantities
     count = len(arrays.ended)
-    names = draws.parameter_names
-    flat = {name: row.reshape(-1, count) for name, row in arrays.variables.items()}
-    before = {name: row.reshape(-1, count) for name, row in arrays.before.items()}
-    constants = draws.constant_variables
+    pairs = ((row, arrays.before[name]) for name, row in arrays.variables.items())
+    flat = [(row.reshape(-1, count), before.reshape(-1, count)) for row, before in pairs]
     return {
         "kept": arrays.kept,
         "done": arrays.done,
         "reads_kept": task.judgement.loads("kept"),
-        "before_inputs": tuple(
-            (element_row(getattr(read, now), index), element_row(getattr(read, name), index))
-            for name, now in PREVIOUS.items()
-            if name not in _KEPT_BY_THE_POOL
-            for index in range(getattr(read, name).size // count)
-        ),
-        "before_judgement": tuple(
-            pair for name in flat for pair in zip(flat[name], before[name], strict=True)
-        ),
-        "input_starts": tuple(
-            (names.index(name), start) if name in names else (-1, start)
-            for name, start in env.interface.start_inputs
-        ),
-        "drawn_variables": tuple(
-            (flat[draw.name][draw.element or 0], number)
-            for number, draw in enumerate(drawn)
-            if draw.name in flat
-        ),
-        "variable_starts": tuple(
-            (row, np.array(value, row.dtype).tobytes())
-            for name, start in constants.items()
-            if name in flat
-            for row, value in zip(flat[name], _elements(arrays.variables[name], start), strict=True)
-        ),
+        "before_inputs": tuple(_previous(arrays)),
+        "before_judgement": tuple(pair for rows in flat for pair in zip(*rows, strict=True)),
+        "starts": tuple(_starts(env, arrays, start_values, drawn)),
         "results": results,
     }
 
 
-def _elements(row: npt.NDArray[Any], start: Any) -> npt.NDArray[Any]:
-    """The start value of each element of a variable."""
-    return np.broadcast_to(start, row.shape[:-1]).reshape(-1)
+def _previous(arrays: EpisodeArrays) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Rows of values, and of the same before the step, which the pool does not keep by itself."""
+    read = arrays.quantities
+    for name, now in PREVIOUS.items():
+        if name not in _KEPT_BY_THE_POOL:
+            for index in range(getattr(read, name).size // len(arrays.ended)):
+                yield (
+                    element_row(getattr(read, now), index),
+                    element_row(getattr(read, name), index),
+                )
+
+
+def _starts(
+    env: FMUEnv, arrays: EpisodeArrays, start_values: FloatArray, drawn: Sequence[Draw]
+) -> Iterator[tuple[npt.NDArray[Any], Start]]:
+    """Rows, and what they hold at the start of an episode, in the order in which they are set."""
+    draws, read = env.episode_start, arrays.quantities
+    names, held = draws.parameter_names, arrays.variables
+    yield arrays.done, b"\0"
+    for row, (name, start) in zip(read.inputs, env.interface.start_inputs, strict=True):
+        is_parameter = name in names
+        yield row, start_values[names.index(name)] if is_parameter else np.float64(start).tobytes()
+    for name, start in draws.constant_variables.items():
+        if name in held:
+            elements = np.broadcast_to(start, held[name].shape[:-1]).reshape(-1)
+            rows = held[name].reshape(-1, len(arrays.ended))
+            for row, value in zip(rows, elements, strict=True):
+                yield row, np.array(value, row.dtype).tobytes()
+    for number, draw in enumerate(drawn):
+        if draw.name in held:
+            yield held[draw.name].reshape(-1, len(arrays.ended))[draw.element or 0], number
+    for now, before in _previous(arrays):
+        yield before, now
+    yield from zip(arrays.kept, read.outputs, strict=True)

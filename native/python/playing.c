@@ -160,8 +160,7 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
          !take_vector(p->done, &b[DONE], WRITTEN, "done", ITEM_BOOLEAN, n))) {
         return false;
     }
-    play_settle(&playing->form, s, self->buffers[INPUTS].buf, b[KEPT].buf, b[COUNTS].buf,
-                b[ENDED].buf);
+    play_settle(&playing->form, s, b[KEPT].buf, b[COUNTS].buf, b[ENDED].buf);
     playing->form.play.streams = b[STATES].buf;
     playing->form.play.done = b[DONE].buf;
     return true;

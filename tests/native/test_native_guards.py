@@ -212,9 +212,7 @@ def surroundings(pool):
         "reads_kept": False,
         "before_inputs": (),
         "before_judgement": (),
-        "drawn_variables": (),
-        "variable_starts": (),
-        "input_starts": ((-1, 0.0),) * len(pool.inputs),
+        "starts": tuple((row, np.float64(0.0).tobytes()) for row in pool.inputs),
     }
 
 
@@ -316,12 +314,12 @@ class TestPrograms:
     @pytest.mark.parametrize(
         "changes",
         [
-            {"drawn_variables": ((np.zeros(6), 1),)},
-            {"drawn_variables": ((np.zeros(6, "f4"), 0),)},
+            {"starts": ((np.zeros(6), 1),)},
+            {"starts": ((np.zeros(6, "f4"), 0),)},
             {"before_inputs": ((np.zeros(3, "f4"), np.zeros(3)),)},
             {"before_judgement": ((np.zeros(3, "f4"), np.zeros(3)),)},
-            {"variable_starts": ((np.zeros(3), b"1"),)},
-            {"input_starts": ()},
+            {"starts": ((np.zeros(3), b"1"),)},
+            {"starts": ((np.zeros(6), np.zeros(6, "f4")),)},
             {"kept": np.zeros((1, 1))},
             {"done": np.zeros(1, np.bool_)},
             {"done": np.zeros(6)},

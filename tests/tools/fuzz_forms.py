@@ -229,9 +229,11 @@ def play_of(inputs, outputs):
         "reads_kept": True,
         "before_inputs": (tuple(variables),),
         "before_judgement": (tuple(variables),),
-        "drawn_variables": (),
-        "variable_starts": ((variables[0], np.float64(2.0).tobytes()),),
-        "input_starts": ((-1, 0.5),),
+        "starts": (
+            (variables[0], np.float64(2.0).tobytes()),
+            (inputs[0], np.float64(0.5).tobytes()),
+            (kept[0], outputs[0]),
+        ),
         "results": results_of(N, 1, 0),
     }
     actions = {

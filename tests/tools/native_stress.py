@@ -162,9 +162,12 @@ class Subject:
                 "reads_kept": bool(self.rng.random() < 0.5),
                 "before_inputs": ((variables[0], before[0]),),
                 "before_judgement": ((variables[0], before[0]),),
-                "drawn_variables": ((variables[0], 0),),
-                "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
-                "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
+                "starts": (
+                    (variables[0], np.float64(1.0).tobytes()),
+                    (variables[0], 0),
+                    *((row, np.float64(0.0).tobytes()) for row in self.pool.inputs),
+                    (before[0], variables[0]),
+                ),
                 "results": results_of(self.n, len(self.outputs), 1),
             },
         )

@@ -44,5 +44,3 @@ def results_of(count, observed, draws):
     flags, seen = ((count,), bool), ((count, observed), np.float32)
     arrays = seen, ((count,), float), flags, flags, flags, ((draws, count), float)
     return False, arrays
-
-
