@@ -3,36 +3,11 @@
 #include "schedule.h"
 
 #include <stdlib.h>
-#include <string.h>
 
 #include "failures.h"
 #include "initial_states.h"
 #include "instances.h"
 #include "recorded_inputs.h"
-
-/* Makes room for wider rows of start values. The values kept so far no longer apply. */
-static bool make_room_for_starts(Pool *pool, const Access *start) {
-    const size_t count = pool->settings.count;
-
-    if (start->count <= pool->start_width) {
-        return true;
-    }
-    double *starts = malloc(count * start->count * sizeof *starts);
-    if (starts == NULL) {
-        return false;
-    }
-    free(pool->starts);
-    pool->starts = starts;
-    pool->start_width = start->count;
-    memset(pool->start_ids, 0, count * sizeof *pool->start_ids);
-    return true;
-}
-
-/* The new start values may need more memory than the pool has. */
-static size_t run_with_starts(Task *task, size_t count) {
-    return make_room_for_starts(task->pool, task->call->start) ? schedule_run(task, count)
-                                                               : task_give_up(task, 0, count);
-}
 
 size_t pool_step(Pool *pool, const Call *call) {
     Task task = {.pool = pool, .call = call, .operation = STEP};
@@ -41,61 +16,7 @@ size_t pool_step(Pool *pool, const Call *call) {
 
 size_t pool_reset(Pool *pool, const Call *call) {
     Task task = {.pool = pool, .call = call, .operation = RESET, .listed = true};
-    return run_with_starts(&task, schedule_choose(pool, call->mask));
-}
-
-static void tell_ends(Task *task, Ends *ends) {
-    ends->ended = (size_t)atomic_get(&task->ended);
-    ends->started = (size_t)atomic_get(&task->started);
-    ends->outside = atomic_get(&task->outside) != 0;
-}
-
-size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
-    Task task = {.pool = pool, .call = call, .operation = PLAY};
-    const size_t troubled = run_with_starts(&task, pool->settings.count);
-
-    tell_ends(&task, ends);
-    return troubled;
-}
-
-size_t pool_play_before(Pool *pool, const Call *call) {
-    Task task = {.pool = pool, .call = call, .operation = BEFORE};
-    return schedule_run(&task, pool->settings.count);
-}
-
-size_t pool_play_after(Pool *pool, const Call *call, Ends *ends) {
-    Task task = {.pool = pool, .call = call, .operation = AFTER};
-    const size_t troubled = schedule_run(&task, pool->settings.count);
-
-    tell_ends(&task, ends);
-    return troubled;
-}
-
-/* Stores the observations of all, as the program makes them. */
-static Verdict observe_all(const Pool *pool, const Turn *turn) {
-    const size_t end = pool->settings.count;
-    PlayScratch registers;
-    Verdict verdict = {.ended = 0};
-
-    play_open(turn, &registers);
-    for (size_t first = 0; first < end; first += RUN) {
-        play_observe(turn, first, length_of_run(first, end), &registers, &verdict);
-    }
-    return verdict;
-}
-
-size_t pool_start(Pool *pool, const Call *call, bool *outside) {
-    const size_t troubled = pool_reset(pool, call);
-
-    if (call->observations == NULL) {
-        const Verdict verdict = observe_all(pool, call->turn);
-        *outside = verdict.outside;
-        return troubled + verdict.troubled;
-    }
-    if (call->mask.data != NULL) {
-        write_all_observations(pool, call->observations);
-    }
-    return troubled;
+    return schedule_run_with_starts(&task, schedule_choose(pool, call->mask));
 }
 
 /* Reads variables of one instance into a column of values. */

@@ -1,4 +1,4 @@
-/* Forms: what opens a pool, and what requests and answers consist of, as bytes.
+/* Forms: what opens a pool, programs, and what requests and answers consist of, as bytes.
  *
  * A form is a row of numbers of 8 bytes: integers, flags and doubles. A block has its size before it,
  * and zeros after it up to the next multiple of 8. A text is a block that ends with a zero. So every
@@ -10,8 +10,7 @@
 #ifndef FMUGYM_FORM_H
 #define FMUGYM_FORM_H
 
-#include "pool.h"
-#include "system.h"
+#include "access.h"
 
 enum { FORM_VERSION = 1 }; /* fmugym/pool/form.py has the same number */
 
@@ -40,37 +39,21 @@ const char **read_texts(Reader *reader, size_t *count);
 const Fmi *read_fmi(Reader *reader);
 /* A list of variables, which the caller closes. Returns whether there is no fault. */
 bool read_access(Reader *reader, const Fmi *fmi, Access *access);
-/* The draws of an episode, without the functions of numpy. Returns whether there is no fault. */
-bool read_draws(Reader *reader, Draws *draws);
 
-/* What opens a pool. */
-typedef struct {
-    char *form; /* a copy of it, which the settings point to */
-    Settings settings; /* without the arrays of the pool */
-    Access inputs, outputs;
-    System *system; /* NULL for one FMU */
-} Opening;
+/* For readers of forms: */
 
-/* Reads the form of a pool. Returns what is wrong with it, or NULL. The caller must drop the opening
- * in any case, and must not move it as long as the pool exists. */
-const char *opening_take(Opening *opening, const void *form, size_t size);
-void opening_drop(Opening *opening);
+extern const char form_truncated[], form_no_memory[]; /* faults */
 
-/* A program, and the memory that belongs to it. */
-typedef struct {
-    Program program;
-    char *form; /* a copy of it, which the program points to */
-    Row *rows;
-    Table *tables;
-    char *filled; /* the memory of the constants' registers */
-    size_t seen_sizes[MOST_SEEN]; /* of each array of observations, for one instance */
-} ProgramForm;
-
-/* Reads the form of a program that so many rows come with. Returns what is wrong with it, or NULL. The
- * caller must drop it in any case; settle it before it runs. */
-const char *program_take(ProgramForm *p, const void *form, size_t size, size_t number_of_rows);
-/* Takes the rows that come with the program. Returns what is wrong, or NULL. */
-const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elements);
-void program_drop(ProgramForm *p);
+/* Notes the fault unless the condition holds. Returns whether there is no fault at all. */
+bool reader_require(Reader *reader, bool holds, const char *fault);
+/* Memory for so many items, and for one at least, which the caller frees; NULL with a fault if memory
+ * runs out. */
+void *reader_room(Reader *reader, size_t count, size_t size);
+/* How many items follow, each of which takes at least 8 bytes. */
+size_t read_count(Reader *reader);
+/* An array with so many values; NULL with the fault if there are more or fewer. */
+const void *read_values(Reader *reader, size_t size, size_t wanted, const char *fault);
+/* A copy of a form at an address that is aligned, which the caller frees, or NULL. */
+char *form_copy(const void *form, size_t size);
 
 #endif

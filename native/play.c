@@ -81,7 +81,7 @@ static Source source_of(const Turn *turn) {
 
 void play_open(const Turn *turn, PlayScratch *scratch) {
     program_prepare(&turn->play->inputs, scratch->memory, &scratch->inputs);
-    program_prepare(&turn->play->judgement, scratch->memory, &scratch->judgement);
+    program_prepare(&turn->play->conclusion, scratch->memory, &scratch->conclusion);
 }
 
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
@@ -209,8 +209,9 @@ void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
 
 /* Avoids branches, because the processor could not predict them. Handles the wide values first,
  * then the bytes. */
-WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const uint8_t *dones,
-                         const uint8_t *cuts, const double *rewards, size_t *troubled) {
+WIDE static size_t end_episodes(const Turn *turn, size_t begin, size_t count,
+                                const uint8_t *dones, const uint8_t *cuts,
+                                const double *rewards, size_t *troubled) {
     const Play *play = turn->play;
     const int64_t *step_counts = play->step_counts + begin;
     const int64_t limit = play->limit;
@@ -252,21 +253,22 @@ static void add_notes(const Notes *notes, size_t count, Verdict *verdict) {
     }
 }
 
-void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
+void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
                 PlayScratch *scratch, Verdict *verdict) {
     const Play *play = turn->play;
     Source source = source_of(turn);
-    const uint16_t *results = play->judgement.results;
-    const void *const *places = scratch->judgement.places;
+    const uint16_t *results = play->conclusion.results;
+    const void *const *places = scratch->conclusion.places;
     Notes notes = {.outside = false};
 
     source.fresh = fresh;
-    copy_rows(&play->before_judgement, begin, count);
-    program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);
+    copy_rows(&play->before_conclusion, begin, count);
+    program_run(&play->conclusion, &source, begin, count, &scratch->conclusion, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
     add_notes(&notes, count, verdict);
-    verdict->ended += judge(turn, begin, count, places[results[DONE]], places[results[TRUNCATED]],
-                            places[results[REWARD]], &verdict->troubled);
+    verdict->ended +=
+        end_episodes(turn, begin, count, places[results[DONE]], places[results[TRUNCATED]],
+                     places[results[REWARD]], &verdict->troubled);
 }
 
 /* Marks the environments as ended while the program runs: there it leaves the episode variables as
@@ -278,10 +280,10 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     uint8_t *ended = play->ended + begin, before[PROGRAM_WIDTH];
     Notes notes = {.outside = false};
 
-    copy_rows(&play->before_judgement, begin, count);
+    copy_rows(&play->before_conclusion, begin, count);
     memcpy(before, ended, count);
     memset(ended, 1, count);
-    program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);
+    program_run(&play->conclusion, &source, begin, count, &scratch->conclusion, &notes);
     memcpy(ended, before, count);
     add_notes(&notes, count, verdict);
 }
@@ -292,7 +294,7 @@ void play_skip(const Turn *turn, size_t index) {
     if (turn->play->done != NULL) {
         turn->play->done[index] = 0;
     }
-    program_clear_seen(&turn->play->judgement, turn->seen, index);
+    program_clear_seen(&turn->play->conclusion, turn->seen, index);
     if (turn->started != NULL) {
         turn->started[index] = 0;
     }

@@ -54,15 +54,15 @@ typedef struct {
 typedef struct {
     size_t count;
     Program inputs;    /* stores the inputs */
-    Program judgement; /* stores the rest; its results are done, truncated, reward */
+    Program conclusion; /* stores the rest; its results are done, truncated, reward */
     Source source;     /* only the statuses; each step sets the rest */
     Actions actions;
     const double *output_rows;
     double *kept_rows; /* the outputs before the step */
     size_t number_of_outputs;
-    bool reads_kept; /* whether the judgement reads them */
+    bool reads_kept; /* whether the conclusion reads them */
     RowCopies before_inputs;    /* what the program of the inputs is going to replace */
-    RowCopies before_judgement; /* the episode variables */
+    RowCopies before_conclusion; /* the episode variables */
     const RowStart *starts; /* in their order */
     size_t number_of_starts;
     double *start_values; /* a row for each start variable */
@@ -76,14 +76,14 @@ typedef struct {
 } Play;
 
 /* One step of all environments, and where its results go. */
-typedef struct {
+typedef struct Turn {
     const Play *play;
     const char *actions;
     double *rewards;
     uint8_t *terminated, *truncated;
-    char *const *seen; /* the arrays of the observations and infos that the judgement stores */
+    char *const *seen; /* the arrays of the observations and infos that the conclusion stores */
     float *last_observations; /* those of episodes that end, where the next ones start at once */
-    char *const *last_seen;   /* the same for the arrays that the judgement stores */
+    char *const *last_seen;   /* the same for the arrays that the conclusion stores */
     const size_t *seen_sizes; /* bytes of one environment in each of these arrays */
     uint8_t *started;         /* where they have started; NULL if they start in the next step */
     double *drawn; /* a row for each draw; only the values drawn in this step are written */
@@ -95,7 +95,7 @@ bool play_has_bad_action(const Turn *turn);
 /* Scratch memory of one thread. */
 typedef struct {
     Register memory[PROGRAM_REGISTERS]; /* of one program at a time */
-    Registers inputs, judgement;
+    Registers inputs, conclusion;
 } PlayScratch;
 
 /* What became of a run. */
@@ -112,7 +112,7 @@ void play_open(const Turn *turn, PlayScratch *scratch);
  * are reset or stepped, the second afterwards where they were reset, the third at last. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
 void play_start_episodes(const Turn *turn, size_t begin, size_t count);
-void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
+void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
                 PlayScratch *scratch, Verdict *verdict);
 
 /* Stores the observations and infos of environments outside of a step or after a start, at most

@@ -10,16 +10,6 @@ typedef struct {
     size_t count;
 } Rows;
 
-/* Memory for so many items, and for one at least. */
-static void *room_for(Reader *reader, size_t count, size_t size) {
-    void *memory = calloc(count + 1, size);
-
-    if (memory == NULL) {
-        reader_refuse(reader, "out of memory");
-    }
-    return memory;
-}
-
 static Row row_of(Reader *reader, const Rows *rows, int64_t number) {
     if (number < 0 || (uint64_t)number >= rows->count) {
         reader_refuse(reader, "there is no such row");
@@ -48,7 +38,7 @@ static void read_actions(Reader *reader, PlayForm *p) {
 static RowCopies read_copies(Reader *reader, RowCopy **memory, const Rows *rows) {
     size_t count;
     const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
-    RowCopy *copies = *memory = room_for(reader, count, sizeof *copies);
+    RowCopy *copies = *memory = reader_room(reader, count, sizeof *copies);
 
     for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
         copies[i] = (RowCopy){row_of(reader, rows, pairs[0]), row_of(reader, rows, pairs[1])};
@@ -88,7 +78,7 @@ static void read_starts(Reader *reader, PlayForm *p, const Rows *rows) {
     size_t count;
     const int64_t *numbers = read_array(reader, 3 * sizeof *numbers, &count);
 
-    p->starts = room_for(reader, count, sizeof *p->starts);
+    p->starts = reader_room(reader, count, sizeof *p->starts);
     p->play.starts = p->starts;
     p->play.number_of_starts = count;
     for (size_t i = 0; i < count && reader->fault == NULL; i++) {
@@ -100,7 +90,7 @@ static void read_program(Reader *reader, PlayForm *p, ProgramForm *program, cons
     const Block form = read_block(reader);
     size_t count;
     const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
-    Row *own = room_for(reader, count, sizeof *own);
+    Row *own = reader_room(reader, count, sizeof *own);
 
     for (size_t i = 0; i < count && reader->fault == NULL; i++) {
         own[i] = row_of(reader, rows, numbers[i]);
@@ -129,12 +119,12 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
     p->play.limit = read_integer(&reader);
     read_actions(&reader, p);
     p->play.before_inputs = read_copies(&reader, &p->before_inputs, &all);
-    p->play.before_judgement = read_copies(&reader, &p->before_judgement, &all);
+    p->play.before_conclusion = read_copies(&reader, &p->before_conclusion, &all);
     read_starts(&reader, p, &all);
     read_program(&reader, p, &p->inputs, &all);
-    read_program(&reader, p, &p->judgement, &all);
+    read_program(&reader, p, &p->conclusion, &all);
     if (reader.at != reader.end || p->inputs.program.number_of_seen > 0 ||
-        p->judgement.program.number_of_results != PROGRAM_RESULTS) {
+        p->conclusion.program.number_of_results != PROGRAM_RESULTS) {
         reader_refuse(&reader, "a program does not fit the pool");
     }
     return reader.fault;
@@ -156,9 +146,9 @@ void play_settle(PlayForm *p, const Settings *s, double *kept, int64_t *step_cou
                  uint8_t *ended) {
     Play *play = &p->play;
 
-    note_outputs(&p->judgement, s);
+    note_outputs(&p->conclusion, s);
     play->inputs = p->inputs.program;
-    play->judgement = p->judgement.program;
+    play->conclusion = p->conclusion.program;
     play->source.statuses = s->status;
     play->output_rows = s->output_values;
     play->number_of_outputs = s->outputs->count;
@@ -169,9 +159,9 @@ void play_settle(PlayForm *p, const Settings *s, double *kept, int64_t *step_cou
 
 void play_drop(PlayForm *p) {
     program_drop(&p->inputs);
-    program_drop(&p->judgement);
+    program_drop(&p->conclusion);
     free(p->before_inputs);
-    free(p->before_judgement);
+    free(p->before_conclusion);
     free(p->starts);
     free(p->form);
 }

@@ -3,15 +3,17 @@
 #ifndef FMUGYM_PLAY_FORM_H
 #define FMUGYM_PLAY_FORM_H
 
-#include "form.h"
+#include "play.h"
+#include "pool.h"
+#include "program_form.h"
 
 /* A play, and the memory that belongs to it. */
 typedef struct {
     Play play;
-    ProgramForm inputs, judgement;
+    ProgramForm inputs, conclusion;
     bool keeps_actions; /* whether hooks read the actions of this step or of the one before */
     char *form;         /* a copy of it, which the play points to */
-    RowCopy *before_inputs, *before_judgement;
+    RowCopy *before_inputs, *before_conclusion;
     RowStart *starts;
 } PlayForm;
 

@@ -14,7 +14,6 @@
 #include "log.h"
 #include "methods.h"
 #include "platform.h"
-#include "play.h"
 
 /* What a step gives of the values that an output has after each of its substeps.
  * fmugym/pool/spec.py lists their names in this order. */
@@ -223,7 +222,7 @@ typedef struct {
     const Access *start; /* the variables set before initialization */
     Matrix start_values;
     float *observations; /* one row of num_observed for each instance, or NULL */
-    const Turn *turn;    /* what runs before and after the steps, or NULL */
+    const struct Turn *turn; /* what runs before and after the steps, see play.h; or NULL */
     bool alone;          /* whether no other thread may help */
 } Call;
 
@@ -265,32 +264,12 @@ bool pool_failure(Pool *pool, size_t index, Failure *copy);
 /* Adds all steps so far to the health counters. */
 void pool_count_steps(Pool *pool);
 
-/* What became of the episodes in a step that plays. */
-typedef struct {
-    size_t ended;   /* how many have ended */
-    size_t started; /* how many of these were followed by another one in the same step */
-    bool outside;   /* whether a hook looked up an index outside of a table */
-} Ends;
-
 /* The following functions return how many instances now have a status worse than a warning. */
 
 /* Steps all instances except those in the mask. Writes all observations. */
 size_t pool_step(Pool *pool, const Call *call);
 /* Resets the instances in the mask, or all if there is no mask. Writes their observations. */
 size_t pool_reset(Pool *pool, const Call *call);
-/* Resets the instances whose episode has ended and steps the others. Runs the programs of the
- * turn before and after. Writes all observations. */
-size_t pool_play(Pool *pool, const Call *call, Ends *ends);
-/* The two parts of a play around steps that are done elsewhere. The first runs the programs that
- * come before, and draws the start values of the instances in the mask, which are to be reset. The
- * second takes the outputs and statuses for those of the step. The turn has no arrays for episodes
- * that start in it, and reads_kept is set: the step overwrites the outputs. */
-size_t pool_play_before(Pool *pool, const Call *call);
-size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
-/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
- * and sets outside if a hook looked up an index outside of a table. */
-size_t pool_start(Pool *pool, const Call *call, bool *outside);
-
 /* How many initializations all pools of this process have begun. */
 uint64_t number_of_initializations(void);
 

@@ -8,6 +8,7 @@
 #include "derivatives.h"
 #include "snapshots.h"
 #include "states.h"
+#include "system.h"
 
 typedef struct {
     Pool *pool;

@@ -473,7 +473,7 @@ static size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
             play_start_episodes(turn, run.begin, run.count);
         }
     }
-    play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
+    play_conclude(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
     return troubled;
 }
 

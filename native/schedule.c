@@ -4,8 +4,10 @@
 
 #include <math.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "inside.h"
+#include "play.h"
 #include "runs.h"
 #include "threads.h"
 
@@ -219,4 +221,27 @@ size_t schedule_choose(Pool *pool, Mask mask) {
         chosen += mask.data == NULL || mask.data[(ptrdiff_t)i * mask.stride] != 0;
     }
     return chosen;
+}
+
+/* Makes room for wider rows of start values. The values kept so far no longer apply. */
+static bool make_room_for_starts(Pool *pool, const Access *start) {
+    const size_t count = pool->settings.count;
+
+    if (start->count <= pool->start_width) {
+        return true;
+    }
+    double *starts = malloc(count * start->count * sizeof *starts);
+    if (starts == NULL) {
+        return false;
+    }
+    free(pool->starts);
+    pool->starts = starts;
+    pool->start_width = start->count;
+    memset(pool->start_ids, 0, count * sizeof *pool->start_ids);
+    return true;
+}
+
+size_t schedule_run_with_starts(Task *task, size_t count) {
+    return make_room_for_starts(task->pool, task->call->start) ? schedule_run(task, count)
+                                                               : task_give_up(task, 0, count);
 }

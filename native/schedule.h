@@ -7,6 +7,8 @@
 
 /* Works on items 0 to count - 1. Returns how many instances have a status worse than a warning. */
 size_t schedule_run(Task *task, size_t count);
+/* The same of a task with start values, which may need more memory than the pool has. */
+size_t schedule_run_with_starts(Task *task, size_t count);
 
 /* Lists the instances in a mask, or all if there is none, for tasks that use a list. Returns
  * their number. */

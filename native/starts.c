@@ -58,7 +58,7 @@ static void keep_last(const Task *task, size_t index) {
         memcpy(turn->last_observations + index * width, observation_of(task, index),
                width * sizeof(float));
     }
-    for (size_t i = 0; i < turn->play->judgement.number_of_seen; i++) {
+    for (size_t i = 0; i < turn->play->conclusion.number_of_seen; i++) {
         const size_t size = turn->seen_sizes[i], place = index * size;
         memcpy(turn->last_seen[i] + place, turn->seen[i] + place, size);
     }
@@ -66,7 +66,7 @@ static void keep_last(const Task *task, size_t index) {
 
 size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started) {
     const Turn *turn = task->call->turn;
-    const bool observes = turn->play->judgement.number_of_seen > 0;
+    const bool observes = turn->play->conclusion.number_of_seen > 0;
     size_t troubled = 0;
 
     for (size_t index = run.begin; index < run.begin + run.count; index++) {

@@ -3,9 +3,10 @@
 #ifndef FMUGYM_STARTS_H
 #define FMUGYM_STARTS_H
 
+#include "play.h"
 #include "task.h"
 
-/* A run of instances that have just been stepped and judged. */
+/* A run of instances that have just been stepped and concluded. */
 typedef struct {
     size_t begin, count;
     PlayScratch *registers;

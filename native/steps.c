@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "instances.h"
+#include "lanes.h"
 
 static const char *const BAD_INPUTS = "the inputs are not finite";
 const char *const BAD_OUTPUTS = "the outputs are not finite";

@@ -308,9 +308,9 @@ def prepare(
             the next step, shape (N,); steps after which an episode is truncated.
         surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether the second
             program reads them; ``done``, for where the latest step has ended the task, shape (N,),
-            or None; ``before_inputs`` and ``before_judgement``, pairs of rows: values, and where
+            or None; ``before_inputs`` and ``before_conclusion``, pairs of rows: values, and where
             they are kept before a program replaces them; ``starts``, pairs of rows and what they
-            hold at the start of an episode, in this order, see ``fmugym.pool.play_form.Start``.
+            hold at the start of an episode, in this order, see ``fmugym.pool.play_form.RowStart``.
             ``results``, whether to return numbers in the place of arrays of one; and the shape and
             type of each array: float32 observations, or those that the second program stores, then
             rewards, terminated and truncated of a step, mask and drawn values (draws, N) of a

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from fmugym.pool.form import Writer
 
-__all__ = ["Rows", "Start", "form_of_play"]
+__all__ = ["Rows", "RowStart", "form_of_play"]
 
 _Row = npt.NDArray[Any]
 
-Start = bytes | _Row | int
+RowStart = bytes | _Row | int
 """The start of a row: the bytes of a constant, the values of another row, or a draw's number."""
 
 
@@ -64,7 +64,7 @@ def form_of_play(
     writer = Writer().integers(surroundings["reads_kept"], limit, none.size)
     writer.integers(*(actions[name] for name in ("size", "check", "lowest", "highest")))
     writer.integers(actions["current"] is not None).block(none.tobytes())
-    for moment in ("before_inputs", "before_judgement"):
+    for moment in ("before_inputs", "before_conclusion"):
         pairs = surroundings[moment]
         writer.array([[number(source), number(to)] for source, to in pairs], np.int64)
     starts = surroundings["starts"]
@@ -74,7 +74,7 @@ def form_of_play(
     return writer.form()
 
 
-def _start_of(rows: Rows, source: Start) -> tuple[int, int]:
+def _start_of(rows: Rows, source: RowStart) -> tuple[int, int]:
     """The kind of a start, a ``StartKind`` of ``native/play.h``, and its number."""
     if isinstance(source, bytes):
         return 0, _bits_of(source)

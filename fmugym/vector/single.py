@@ -62,7 +62,7 @@ class ExpressionStep:
         pool, draws = env._instance.pool, env.episode_start
         rows = batched(env, 1, pool)
         starts = draws.constants[:, None].copy()
-        if task.inputs.loads("parameter") or task.judgement.loads("parameter"):
+        if task.inputs.loads("parameter") or task.conclusion.loads("parameter"):
             numbers = zip(draws.parameter_names, starts, strict=True)
             rows.parameters = {name: row for name, row in numbers if name not in draws.strings}
         self._arrays = arrays = EpisodeArrays(env, rows, np.zeros(1, np.bool_))
@@ -105,7 +105,7 @@ class ExpressionStep:
             played = self._play_element(env, action)
         troubled, ended, reward, terminated, truncated, seen, _ = played
         if troubled:
-            return self._judge_again(env)
+            return self._conclude_again(env)
         if ended:
             self._arrays.ended[0] = False  # a reset begins the next episode, not the pool
         else:
@@ -122,8 +122,8 @@ class ExpressionStep:
         env._ended = True
         return self._play(element if element.shape else element.item(), False)
 
-    def _judge_again(self, env: FMUEnv) -> Result:
-        """Judge a step in Python, whose status or a number is not good, from before it on."""
+    def _conclude_again(self, env: FMUEnv) -> Result:
+        """Conclude a step in Python, whose status or a number is not good, from before it on."""
         arrays, read, conversions = self._arrays, env._episode, env._conversions
         values, read.outputs = read.outputs, arrays.kept[:, 0]
         for name in self._updated:

@@ -13,7 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.expressions.program import LETTERS
 from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.base import FloatArray, Play
-from fmugym.pool.play_form import Start
+from fmugym.pool.play_form import RowStart
 from fmugym.task.episode_start import Draw
 from fmugym.vector.episode_arrays import EpisodeArrays, element_row
 from fmugym.vector.hooks.task_programs import TaskPrograms
@@ -55,7 +55,7 @@ def prepare_step(
     judged = ((count,), real), flags, flags, flags
     return env._instance.pool.prepare_play(
         env.episode_start.model_variables,
-        (task.inputs.with_rows(arrays.find), task.judgement.with_rows(arrays.find)),
+        (task.inputs.with_rows(arrays.find), task.conclusion.with_rows(arrays.find)),
         _actions(env, arrays),
         starts,
         (native, streams),
@@ -116,9 +116,9 @@ def _surroundings(
     return {
         "kept": arrays.kept,
         "done": arrays.done,
-        "reads_kept": task.judgement.loads("kept"),
+        "reads_kept": task.conclusion.loads("kept"),
         "before_inputs": tuple(_previous(arrays)),
-        "before_judgement": tuple(pair for rows in flat for pair in zip(*rows, strict=True)),
+        "before_conclusion": tuple(pair for rows in flat for pair in zip(*rows, strict=True)),
         "starts": tuple(_starts(env, arrays, start_values, drawn)),
         "results": results,
     }
@@ -138,7 +138,7 @@ def _previous(arrays: EpisodeArrays) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 def _starts(
     env: FMUEnv, arrays: EpisodeArrays, start_values: FloatArray, drawn: Sequence[Draw]
-) -> Iterator[tuple[npt.NDArray[Any], Start]]:
+) -> Iterator[tuple[npt.NDArray[Any], RowStart]]:
     """Rows, and what they hold at the start of an episode, in the order in which they are set."""
     draws, read = env.episode_start, arrays.quantities
     names, held = draws.parameter_names, arrays.variables

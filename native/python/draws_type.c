@@ -1,5 +1,6 @@
 /* The type Draws: the distributions of an episode. Also the seeding of random streams. */
 
+#include "program_form.h"
 #include "python.h"
 
 PyTypeObject *draws_type;

@@ -167,14 +167,14 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
 }
 
 bool pool_observes(const Playing *playing) {
-    return playing->form.judgement.program.number_of_seen == 0 &&
+    return playing->form.conclusion.program.number_of_seen == 0 &&
            results_number_of_seen(playing->results) == 1;
 }
 
 static bool results_fit(const PyPool *self, const Playing *playing) {
     const Settings *s = &self->pool.settings;
     const Results *r = playing->results;
-    const size_t seen = playing->form.judgement.program.number_of_seen;
+    const size_t seen = playing->form.conclusion.program.number_of_seen;
     bool fit = (s->count == 1 || !results_are_of_one(r)) &&
                results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
                results_size(r, TERMINATED_ARRAY) == s->count &&
@@ -187,7 +187,7 @@ static bool results_fit(const PyPool *self, const Playing *playing) {
         return fit && results_size(r, 0) == s->count * s->num_observed * sizeof(float);
     }
     for (size_t i = 0; i < seen && fit; i++) {
-        fit = results_size(r, i) == s->count * playing->form.judgement.seen_sizes[i];
+        fit = results_size(r, i) == s->count * playing->form.conclusion.seen_sizes[i];
     }
     return fit && results_number_of_seen(r) == seen;
 }

@@ -4,6 +4,7 @@
 #define FMUGYM_PLAYING_H
 
 #include "play_form.h"
+#include "player.h"
 #include "programs.h"
 #include "results.h"
 

@@ -135,8 +135,8 @@ static void settle_starts_at_ends(const Playing *playing, const ResultArrays *ar
         t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
     }
     t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
-    for (size_t i = 0; i < playing->form.judgement.program.number_of_seen; i++) {
-        t->seen_sizes[i] = playing->form.judgement.seen_sizes[i];
+    for (size_t i = 0; i < playing->form.conclusion.program.number_of_seen; i++) {
+        t->seen_sizes[i] = playing->form.conclusion.seen_sizes[i];
     }
 }
 

@@ -3,6 +3,7 @@
 #ifndef FMUGYM_PROGRAMS_H
 #define FMUGYM_PROGRAMS_H
 
+#include "program_form.h"
 #include "python.h"
 
 enum { MOST_DIMENSIONS = 8 }; /* of an action */

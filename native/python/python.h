@@ -11,7 +11,8 @@
 #endif
 
 #include "buffers.h"
-#include "form.h"
+#include "draws.h"
+#include "pool_form.h"
 
 enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 

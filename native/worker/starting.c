@@ -99,7 +99,7 @@ static const Access *find_list(Worker *w, Reader *reader) {
 }
 
 /* The values of a list of variables, one column for each instance. */
-static Matrix read_values(Worker *w, Reader *reader, const Access *access) {
+static Matrix take_values(Worker *w, Reader *reader, const Access *access) {
     const size_t n = w->opening.settings.count, count = access == NULL ? 0 : access->count;
     size_t values;
     const double *first = read_array(reader, sizeof *first, &values);
@@ -112,7 +112,7 @@ static Matrix read_values(Worker *w, Reader *reader, const Access *access) {
 
 Answer answer_start(Worker *w, Reader *reader, Writer *writer) {
     const Access *start = find_list(w, reader);
-    const Matrix values = read_values(w, reader, start);
+    const Matrix values = take_values(w, reader, start);
     const Call call = {.inputs = shared_inputs(w),
                        .start = start,
                        .start_values = values,

@@ -4,6 +4,7 @@
 #ifndef FMUGYM_WORKER_H
 #define FMUGYM_WORKER_H
 
+#include "../pool_form.h"
 #include "../requests.h"
 #include "frames.h"
 

@@ -211,17 +211,17 @@ def surroundings(pool):
         "done": None,
         "reads_kept": False,
         "before_inputs": (),
-        "before_judgement": (),
+        "before_conclusion": (),
         "starts": tuple((row, np.float64(0.0).tobytes()) for row in pool.inputs),
     }
 
 
-def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):
+def prepare(pool, inputs, conclusion=None, rows=(0,), draws=None, **changes):
     n = pool.num_instances
     results = results_of(n, pool.observations.shape[1], len(rows))
     return pool.prepare_play(
         (pool.variable("theta_0"),),
-        (inputs, judgement or program(results=(0, 0, 0))),
+        (inputs, conclusion or program(results=(0, 0, 0))),
         DISCRETE | changes.pop("actions", {}),
         np.zeros((1, n)),
         draws or (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
@@ -317,7 +317,7 @@ class TestPrograms:
             {"starts": ((np.zeros(6), 1),)},
             {"starts": ((np.zeros(6, "f4"), 0),)},
             {"before_inputs": ((np.zeros(3, "f4"), np.zeros(3)),)},
-            {"before_judgement": ((np.zeros(3, "f4"), np.zeros(3)),)},
+            {"before_conclusion": ((np.zeros(3, "f4"), np.zeros(3)),)},
             {"starts": ((np.zeros(3), b"1"),)},
             {"starts": ((np.zeros(6), np.zeros(6, "f4")),)},
             {"kept": np.zeros((1, 1))},

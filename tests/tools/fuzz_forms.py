@@ -228,7 +228,7 @@ def play_of(inputs, outputs):
         "done": None,
         "reads_kept": True,
         "before_inputs": (tuple(variables),),
-        "before_judgement": (tuple(variables),),
+        "before_conclusion": (tuple(variables),),
         "starts": (
             (variables[0], np.float64(2.0).tobytes()),
             (inputs[0], np.float64(0.5).tobytes()),

@@ -161,7 +161,7 @@ class Subject:
                 "done": np.zeros(self.n, np.bool_) if self.rng.random() < 0.5 else None,
                 "reads_kept": bool(self.rng.random() < 0.5),
                 "before_inputs": ((variables[0], before[0]),),
-                "before_judgement": ((variables[0], before[0]),),
+                "before_conclusion": ((variables[0], before[0]),),
                 "starts": (
                     (variables[0], np.float64(1.0).tobytes()),
                     (variables[0], 0),

@@ -48,9 +48,9 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
     if env._instance.tells:
         raise UncompilableError("the pool tells infos of its own")
     letter_of(np.dtype(env.action_space.dtype))
-    judgement, seen, updated = _Judgement(env, formulas).made()
+    conclusion, seen, updated = _Conclusion(env, formulas).made()
     types = dict.fromkeys(env.variables, _DOUBLE)
-    return TaskPrograms(_inputs(env, formulas), judgement, seen, types, updated)
+    return TaskPrograms(_inputs(env, formulas), conclusion, seen, types, updated)
 
 
 def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
@@ -201,7 +201,7 @@ def written_variables(
     return {key: where(is_active, value, before.quantity(*key)) for key, value in written.items()}
 
 
-class _Judgement:
+class _Conclusion:
     """The program that follows the FMU's step.
 
     Args:

@@ -39,7 +39,7 @@ class TaskPrograms:
 
     Attributes:
         inputs: From the action to the inputs.
-        judgement: From the outputs to done, truncated and reward; it stores the episode variables,
+        conclusion: From the outputs to done, truncated and reward; it stores the episode variables,
             the observation if it is not the default one, and the info.
         seen: The arrays that the second program stores.
         variables: The types of the episode variables by name.
@@ -47,7 +47,7 @@ class TaskPrograms:
     """
 
     inputs: Program
-    judgement: Program
+    conclusion: Program
     seen: tuple[SeenArray, ...]
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
@@ -63,17 +63,17 @@ class TaskPrograms:
         graph, flag = Graph(), np.dtype(np.bool_)
         stopped = graph.load("stopped", None, flag)
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
-        judgement = compile_graph(graph, [], [stopped, *others], 0)
+        conclusion = compile_graph(graph, [], [stopped, *others], 0)
         types = dict.fromkeys(variables, np.dtype(np.float64))
         graph = Graph()
         given = [graph.load("row", ("given", i), np.dtype(np.float64)) for i in range(inputs)]
         stores = [Store(node, ("input", i)) for i, node in enumerate(given)]
-        return cls(compile_graph(graph, stores, [], 0), judgement, (), types, ())
+        return cls(compile_graph(graph, stores, [], 0), conclusion, (), types, ())
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TaskPrograms:
         """The same task with other tables, by the bytes of those whose place they take."""
-        inputs, judgement = (one.with_tables(tables) for one in (self.inputs, self.judgement))
-        return replace(self, inputs=inputs, judgement=judgement)
+        inputs, conclusion = (one.with_tables(tables) for one in (self.inputs, self.conclusion))
+        return replace(self, inputs=inputs, conclusion=conclusion)
 
 
 def to_input_type(variable: Variable, value: Value) -> Value:

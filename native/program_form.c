@@ -1,0 +1,126 @@
+/* Reader of the forms of programs, and of draws. */
+
+#include "program_form.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+bool read_draws(Reader *reader, Draws *draws) {
+    size_t numbers;
+
+    draws->draws = read_array(reader, sizeof(Draw), &draws->count);
+    draws->numbers = read_array(reader, sizeof(double), &numbers);
+    return reader_require(reader, reader->at == reader->end, form_truncated) &&
+           reader_require(reader, draws_are_sound(draws, numbers),
+                   "the numbers do not fit the kinds of distributions");
+}
+
+enum { LARGEST_SEEN = 1 << 24 }; /* elements of an observation */
+
+static const char UNSOUND[] = "its parts do not fit together";
+
+static void read_tables(Reader *reader, ProgramForm *p) {
+    const size_t count = p->program.number_of_tables = read_count(reader);
+
+    p->tables = reader_room(reader, count, sizeof *p->tables);
+    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
+        Table *table = &p->tables[i];
+        table->size = (size_t)read_integer_in(reader, 1, 8);
+        table->data = read_array(reader, table->size, &table->length);
+    }
+    p->program.tables = p->tables;
+}
+
+/* Reads how large the arrays of observations must be. */
+static void measure_seen(Reader *reader, ProgramForm *p) {
+    static const size_t sizes[VALUE_TYPES] = {8, 4, 8, 1, 1};
+
+    for (size_t i = 0; i < p->program.number_of_slots && reader->fault == NULL; i++) {
+        const Slot *slot = &p->program.slots[i];
+        if (!reader_require(reader, slot->array < MOST_SEEN && slot->type < VALUE_TYPES &&
+                                 slot->elements <= LARGEST_SEEN,
+                     UNSOUND)) {
+            return;
+        }
+        const size_t size = slot->elements * sizes[slot->type];
+        size_t *known = &p->seen_sizes[slot->array];
+        reader_require(reader, *known == 0 || *known == size, UNSOUND);
+        *known = size;
+    }
+}
+
+static void read_results(Reader *reader, Program *program) {
+    const int64_t *results = read_array(reader, sizeof *results, &program->number_of_results);
+
+    reader_require(reader, program->number_of_results <= PROGRAM_RESULTS, UNSOUND);
+    for (size_t i = 0; i < program->number_of_results && reader->fault == NULL; i++) {
+        reader_require(reader, results[i] >= 0 && results[i] < PROGRAM_REGISTERS, UNSOUND);
+        program->results[i] = (uint16_t)results[i];
+    }
+}
+
+const char *program_take(ProgramForm *p, const void *form, size_t size, size_t number_of_rows) {
+    Program *program = &p->program;
+
+    memset(p, 0, sizeof *p);
+    p->form = form_copy(form, size);
+    if (p->form == NULL) {
+        return form_no_memory;
+    }
+    Reader reader = {p->form, p->form + size, NULL};
+    program->registers = (size_t)read_integer_in(&reader, 0, PROGRAM_REGISTERS);
+    program->number_of_seen = (size_t)read_integer_in(&reader, 0, MOST_SEEN);
+    program->code = read_array(&reader, sizeof(Instruction), &program->length);
+    program->constants = read_array(&reader, sizeof(Constant), &program->number_of_constants);
+    program->slots = read_array(&reader, sizeof(Slot), &program->number_of_slots);
+    program->rows = p->rows = reader_room(&reader, number_of_rows, sizeof *p->rows);
+    program->number_of_rows = number_of_rows;
+    read_results(&reader, program);
+    read_tables(&reader, p);
+    measure_seen(&reader, p);
+    reader_require(&reader, reader.at == reader.end, form_truncated);
+    return reader.fault;
+}
+
+/* The constants' registers begin at the first place in their memory that is aligned. */
+static bool fill_constants(ProgramForm *p) {
+    const size_t alignment = _Alignof(Register);
+
+    p->filled = malloc((p->program.number_of_constants + 1) * sizeof(Register));
+    const size_t past = (size_t)((uintptr_t)p->filled % alignment);
+    Register *filled = (Register *)(void *)(p->filled + (past == 0 ? 0 : alignment - past));
+    for (size_t i = 0; p->filled != NULL && i < p->program.number_of_constants; i++) {
+        program_fill(&p->program.constants[i], &filled[i]);
+    }
+    p->program.filled = filled;
+    return p->filled != NULL;
+}
+
+/* Two rows may be the same memory. */
+static void note_changes(ProgramForm *p) {
+    for (size_t i = 0; i < p->program.length; i++) {
+        const Instruction *code = &p->program.code[i];
+        for (size_t k = 0; code->operation == STORE_ROW && k < p->program.number_of_rows; k++) {
+            p->rows[k].changes |= p->rows[k].data == p->rows[code->extra].data;
+        }
+    }
+}
+
+const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elements) {
+    memcpy(p->rows, rows, p->program.number_of_rows * sizeof *rows);
+    if (!program_is_sound(&p->program, action_elements)) {
+        return UNSOUND;
+    }
+    if (!fill_constants(p)) {
+        return form_no_memory;
+    }
+    note_changes(p);
+    return NULL;
+}
+
+void program_drop(ProgramForm *p) {
+    free(p->rows);
+    free(p->tables);
+    free(p->filled);
+    free(p->form);
+}
