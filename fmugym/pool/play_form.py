@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fmugym.pool.form import Writer
 
-__all__ = ["Rows", "RowStart", "form_of_play"]
+__all__ = ["RowStart", "Rows", "form_of_play"]
 
 _Row = npt.NDArray[Any]
 
