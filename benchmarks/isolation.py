@@ -22,7 +22,7 @@ from tables import Table, duration, share
 
 import fmugym
 from fmugym.envs import CartPoleEnv
-from fmugym.vector.making import make_with_pool
+from fmugym.vector.env_maker import make_with_pool
 
 __all__ = ["tables"]
 

@@ -52,7 +52,7 @@ __all__ = [
 
 _ARGUMENTS: Final = (*("fmu_path", "config", "log_level", "render_mode", "backend", "isolation"),)
 
-_COMPILED: Final = "fmugym.vector.single"
+_COMPILED: Final = "fmugym.vector.expression_step"
 """The module of compiled steps is imported late: it needs this one, and takes a while."""
 
 

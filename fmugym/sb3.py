@@ -23,7 +23,7 @@ from fmugym.extras import lacking
 from fmugym.pool.base import MaskArray
 from fmugym.scaling import scaled_space, unscaled
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.codec import handed_out
+from fmugym.vector.info_arrays import handed_out
 from fmugym.vector.infos import observation_of
 from fmugym.vector.libraries import make_vector_env, require_vector_env
 from fmugym.vector.vector_env import require_open

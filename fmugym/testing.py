@@ -23,8 +23,8 @@ from gymnasium.utils.env_checker import data_equivalence
 from fmugym.checks import has_method
 from fmugym.env import FMUEnv, inner_env
 from fmugym.errors import ConfigError, ContractError, FMUGymError, shown
-from fmugym.vector.choosing import no_arrays, require_own_order
 from fmugym.vector.hooks.check import CURE, find_difference
+from fmugym.vector.task_choice import no_arrays, require_own_order
 
 __all__ = ["check_fmu_env", "check_hooks"]
 

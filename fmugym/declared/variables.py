@@ -20,8 +20,8 @@ from fmugym.declared.section_entries import Limits, read_limits
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
 from fmugym.task.ranges import within
-from fmugym.task.roles import check_input, check_output
 from fmugym.task.starting import checked, spread
+from fmugym.task.variable_roles import check_input, check_output
 
 __all__ = [
     "NAMING",

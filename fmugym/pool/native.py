@@ -22,7 +22,6 @@ from fmugym import _native
 from fmugym.archive.fmu import FMU, copy_libraries, extracted_again
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.pool.asking import AskingPool
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -32,6 +31,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import IndexArray
+from fmugym.pool.engine_pool import EnginePool
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import new_arrays
@@ -61,7 +61,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(AskingPool):
+class NativePool(EnginePool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -190,7 +190,7 @@ class NativePool(AskingPool):
         content: Callable[[slice], bytes],
         read: Callable[[Reader, int], R],
     ) -> list[R]:
-        """See ``AskingPool._ask``; the instances are one block."""
+        """See ``EnginePool._ask``; the instances are one block."""
         count = self.num_instances
         return [
             self._ask_pool(request, content(slice(0, count)), lambda reader: read(reader, count))

@@ -16,7 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import unknown_name
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.task.quantity import Quantities, Quantity
-from fmugym.task.roles import require_numeric
+from fmugym.task.variable_roles import require_numeric
 
 __all__ = ["RecordedEnvs", "RecordedQuantities", "choose", "matches", "quantities_of"]
 

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.around import play_around
 from fmugym.pool.base import FloatArray, MaskArray, Play, Pool, PoolSpec, StatusArray
 from fmugym.pool.spec import ResetMethod
+from fmugym.pool.surrounding_programs import play_around
 from fmugym.trial.opening import open_pool
 from fmugym.trial.pool_options import PoolOptions
 

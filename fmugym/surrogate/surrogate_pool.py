@@ -12,7 +12,6 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.around import play_around
 from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
 from fmugym.pool.bundle import (
     Bundle,
@@ -23,6 +22,7 @@ from fmugym.pool.bundle import (
     surrogate_state,
 )
 from fmugym.pool.health import Column, CountedPool, new_arrays
+from fmugym.pool.surrounding_programs import play_around
 from fmugym.surrogate.start_outputs import Start
 from fmugym.surrogate.terms import Terms
 

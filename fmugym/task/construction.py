@@ -36,9 +36,9 @@ from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.hooks import AssignedHook, Hooks, misspelt_hooks
 from fmugym.task.instance import Instance
 from fmugym.task.interface import Interface, resolve
+from fmugym.task.own_attributes import plain_attributes
 from fmugym.task.own_hooks import OwnHooks, is_overridden
 from fmugym.task.pictures import Pictured
-from fmugym.task.plain import plain_attributes
 from fmugym.task.pool_opening import (
     env_numbers,
     open_env_pool,

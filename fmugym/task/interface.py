@@ -23,7 +23,6 @@ from fmugym.pool.spec import (
     whole_number_of_steps,
 )
 from fmugym.task.ranges import within
-from fmugym.task.roles import check_input, check_output, check_readable
 from fmugym.task.starting import (
     check_rest_is_known,
     checked,
@@ -31,6 +30,7 @@ from fmugym.task.starting import (
     structural_values,
     texts_in,
 )
+from fmugym.task.variable_roles import check_input, check_output, check_readable
 
 __all__ = [
     "Interface",

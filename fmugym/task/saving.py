@@ -17,7 +17,7 @@ from fmugym.expressions.quantities import KEPT, EpisodeQuantity
 from fmugym.pool import Pool
 from fmugym.pool.extension import needs_engine
 from fmugym.task.construction import Constructed
-from fmugym.task.plain import changed, plain_attributes
+from fmugym.task.own_attributes import changed, plain_attributes
 from fmugym.task.snapshot import Columns, Scope, SnapshotColumn
 
 __all__ = [

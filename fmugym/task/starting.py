@@ -13,7 +13,7 @@ from fmugym.archive.variable import Variable, checked_value, unknown_rest
 from fmugym.checks import parts_of_array
 from fmugym.distributions import Choice, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown
-from fmugym.task.roles import require_not_driven, require_numeric
+from fmugym.task.variable_roles import require_not_driven, require_numeric
 
 __all__ = [
     "check_rest_is_known",

@@ -44,8 +44,8 @@ from fmugym.tools.response import advise_episodes
 from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.choosing import hook_of_one, no_arrays
 from fmugym.vector.hooks.check import CURE, find_difference, own_hooks
+from fmugym.vector.task_choice import hook_of_one, no_arrays
 
 __all__ = ["validate"]
 

@@ -21,17 +21,25 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.task.construction import draws_of
 from fmugym.task.episode import Episode, standing_in
 from fmugym.task.episode_start import EpisodeStart, EpisodeValues
-from fmugym.task.plain import put_back
+from fmugym.task.own_attributes import put_back
 from fmugym.task.reset import EpisodeReset
 from fmugym.task.saving import note_attributes
 from fmugym.task.snapshot import Columns
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.vector.action_arrays import array_of
 from fmugym.vector.attributes import require_settable
-from fmugym.vector.column import PoolColumn
 from fmugym.vector.episode_arrays import EpisodeArrays
 from fmugym.vector.episodes import Episodes, attribute
 from fmugym.vector.hooks import hook_results
+from fmugym.vector.pool_column import PoolColumn
+from fmugym.vector.quantity_arrays import (
+    EpisodeColumn,
+    batched,
+    keep_rows,
+    some,
+    start_numbers,
+    take,
+)
 from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
     batch_columns,
@@ -40,7 +48,6 @@ from fmugym.vector.vector_saving import (
     require_fit,
     which_of,
 )
-from fmugym.vector.views import EpisodeColumn, batched, keep_rows, some, start_numbers, take
 
 __all__ = ["ArrayEpisodes"]
 

@@ -14,7 +14,6 @@ from fmugym.pool.health import fault_rates
 from fmugym.pool.licences import require_started
 from fmugym.task.faults import not_finite
 from fmugym.vector.array_episodes import ArrayEpisodes
-from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.array_calls import (
     infos_of_hooks,
@@ -22,6 +21,7 @@ from fmugym.vector.hooks.array_calls import (
     require_finite_start,
     require_possible_inputs,
 )
+from fmugym.vector.info_arrays import coded, with_masks
 from fmugym.vector.infos import copy_rows, observation_of, rows_not_finite
 from fmugym.vector.tasks import StepResult, failed_in
 

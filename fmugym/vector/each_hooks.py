@@ -22,7 +22,7 @@ from fmugym.task.faults import Result
 from fmugym.task.future import assumed, future_of
 from fmugym.task.pictures import note_for_picture
 from fmugym.vector.action_arrays import checked_actions, is_array_space
-from fmugym.vector.codec import gathered, mapped
+from fmugym.vector.info_arrays import gathered, mapped
 from fmugym.vector.separate_episodes import SeparateEpisodes
 from fmugym.vector.tasks import StepResult, VectorTask
 

@@ -1,4 +1,4 @@
-"""Infos and observations of N environments; ``fmugym.vector.codec`` has the form of infos."""
+"""Infos and observations of N environments; ``fmugym.vector.info_arrays`` has the form of infos."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import environments_first
 from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.values import LateDict
-from fmugym.vector.codec import coded, mapped, masked
+from fmugym.vector.info_arrays import coded, mapped, masked
 
 __all__ = [
     "copy_rows",

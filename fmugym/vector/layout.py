@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import MaskArray
-from fmugym.vector.codec import coded, mapped, with_masks
 from fmugym.vector.hooks.task_programs import TaskPrograms
+from fmugym.vector.info_arrays import coded, mapped, with_masks
 
 __all__ = ["Layout", "LayoutOfOne"]
 

@@ -16,8 +16,8 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.candidates import Candidates
-from fmugym.vector.codec import mapped
 from fmugym.vector.episodes import Episodes
+from fmugym.vector.info_arrays import mapped
 from fmugym.vector.infos import copy_rows
 from fmugym.vector.tasks import StepResult, VectorTask
 

@@ -16,9 +16,9 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.task.construction import draws_of, prepare_hooks
 from fmugym.task.saving import columns_of, note_attributes, place_columns
 from fmugym.task.snapshot import Columns, stacked
-from fmugym.vector.column import PoolColumn
 from fmugym.vector.episodes import Episodes
-from fmugym.vector.views import take
+from fmugym.vector.pool_column import PoolColumn
+from fmugym.vector.quantity_arrays import take
 
 __all__ = ["SeparateEpisodes"]
 

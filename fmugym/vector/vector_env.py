@@ -30,6 +30,7 @@ from fmugym.vector.arguments import (
     checked_seeds,
     split_options,
 )
+from fmugym.vector.async_step import Background, PendingStepError
 from fmugym.vector.attributes import Attributes
 from fmugym.vector.candidates import (
     Candidates,
@@ -38,11 +39,10 @@ from fmugym.vector.candidates import (
     tables_of,
     tunable_values,
 )
-from fmugym.vector.choosing import make_task, require_own_order
+from fmugym.vector.env_maker import EnvMaker
 from fmugym.vector.episodes import Episodes
-from fmugym.vector.making import EnvMaker
-from fmugym.vector.overlap import Background, PendingStepError
 from fmugym.vector.rollouts import Rollout, returning_to, roll_out, start_of_rollout
+from fmugym.vector.task_choice import make_task, require_own_order
 from fmugym.vector.tasks import StepResult, VectorTask
 from fmugym.vector.vector_saving import chosen, sources_for
 

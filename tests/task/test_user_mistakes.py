@@ -33,7 +33,7 @@ from fmugym.baselines import PID
 from fmugym.config import EnvConfig
 from fmugym.errors import ArgumentError
 from fmugym.task.episode import READABLE
-from fmugym.task.plain import plain_attributes
+from fmugym.task.own_attributes import plain_attributes
 
 
 @pytest.mark.parametrize("group", mistakes.GROUPS)

@@ -20,10 +20,10 @@ from ways import in_way
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
-from fmugym.pool.around import programs_for
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.requests import Answer, Request, request_listing
+from fmugym.pool.surrounding_programs import programs_for
 
 
 @pytest.fixture(name="make")

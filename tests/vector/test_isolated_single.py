@@ -17,7 +17,7 @@ from ways import in_python
 
 import fmugym
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.vector.making import make_with_pool
+from fmugym.vector.env_maker import make_with_pool
 
 
 def isolated(make_env):

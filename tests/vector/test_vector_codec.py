@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from vector_tools import require_same_infos
 
 from fmugym import ConfigError
-from fmugym.vector.codec import gathered, handed_out
+from fmugym.vector.info_arrays import gathered, handed_out
 
 COUNT = 4
 KINDS = {

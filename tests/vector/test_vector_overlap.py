@@ -26,7 +26,7 @@ from ways import in_way
 import fmugym
 from fmugym import ConfigError, SimulationError
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.overlap import NoStepError, PendingStepError, StepTimeoutError
+from fmugym.vector.async_step import NoStepError, PendingStepError, StepTimeoutError
 
 
 @pytest.fixture

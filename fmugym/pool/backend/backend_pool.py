@@ -101,7 +101,7 @@ class BackendPool(CountedPool):
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""
-        from fmugym.pool.around import play_around
+        from fmugym.pool.surrounding_programs import play_around
 
         return play_around(self, self._spec, variables, *parts)
 

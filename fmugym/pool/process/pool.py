@@ -25,7 +25,6 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.asking import AskingPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -36,6 +35,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import IndexArray
+from fmugym.pool.engine_pool import EnginePool
 from fmugym.pool.form import Writer
 from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
@@ -55,7 +55,7 @@ R = TypeVar("R")
 _CLOSING_TIME: Final = 5.0
 
 
-class ProcessPool(AskingPool):
+class ProcessPool(EnginePool):
     """N instances in blocks of supervised processes; see ``Pool`` for the contract.
 
     Args:
@@ -257,7 +257,7 @@ class ProcessPool(AskingPool):
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""
-        from fmugym.pool.around import play_around
+        from fmugym.pool.surrounding_programs import play_around
 
         return play_around(self, self._spec, variables, *parts)
 
@@ -328,7 +328,7 @@ class ProcessPool(AskingPool):
         content: Callable[[slice], bytes],
         read: Callable[[Reader, int], R],
     ) -> list[R]:
-        """See ``AskingPool._ask``; each worker has a block."""
+        """See ``EnginePool._ask``; each worker has a block."""
         with self._lock:
             self._require_present()
             group = self._group

@@ -25,13 +25,13 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
 from fmugym.task.episode import Episode, standing_in
 from fmugym.task.hooks import Hooks
-from fmugym.task.plain import changed, plain_attributes, put_back
+from fmugym.task.own_attributes import changed, plain_attributes, put_back
 from fmugym.task.results import as_flag, as_info, as_reward
 from fmugym.task.step import ORDER
 from fmugym.task.values import EpisodeVariables, ParameterValues
-from fmugym.vector.codec import mapped
 from fmugym.vector.hooks import hook_results
-from fmugym.vector.views import EpisodeColumn, batched
+from fmugym.vector.info_arrays import mapped
+from fmugym.vector.quantity_arrays import EpisodeColumn, batched
 
 __all__ = ["CURE", "find_difference", "own_hooks"]
 

@@ -20,7 +20,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import environments_first
 from fmugym.task.episode_start import EpisodeStart
 from fmugym.task.results import given
-from fmugym.vector.codec import coded
+from fmugym.vector.info_arrays import coded
 
 __all__ = [
     "flags",

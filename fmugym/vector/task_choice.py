@@ -17,10 +17,10 @@ from fmugym.task.step import ORDER
 from fmugym.vector.action_arrays import is_array_space
 from fmugym.vector.array_hooks import ArrayHooks
 from fmugym.vector.each_hooks import EachHooks
+from fmugym.vector.env_maker import EnvMaker
 from fmugym.vector.expressions import Expressions
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.making import EnvMaker
 from fmugym.vector.tasks import VectorTask
 
 __all__ = ["hook_of_one", "make_task", "no_arrays", "require_own_order"]

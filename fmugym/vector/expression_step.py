@@ -19,8 +19,8 @@ from fmugym.vector.episode_arrays import EpisodeArrays
 from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 from fmugym.vector.hooks.task_programs import TaskPrograms
 from fmugym.vector.layout import LayoutOfOne
+from fmugym.vector.quantity_arrays import EpisodeColumn, batched
 from fmugym.vector.step_form import prepare_step
-from fmugym.vector.views import EpisodeColumn, batched
 
 __all__ = ["ExpressionStep", "expression_step_of"]
 

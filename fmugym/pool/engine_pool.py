@@ -22,12 +22,12 @@ from fmugym.pool.requests import (
 )
 from fmugym.pool.saving_pool import SavingPool
 
-__all__ = ["AskingPool"]
+__all__ = ["EnginePool"]
 
 R = TypeVar("R")
 
 
-class AskingPool(SavingPool):
+class EnginePool(SavingPool):
     """A pool whose instances are in blocks, here or in other processes, asked by forms."""
 
     @abstractmethod
