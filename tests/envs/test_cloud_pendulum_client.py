@@ -134,7 +134,7 @@ class TestRealClient:
             ("get_position", lambda: float("nan"), "the outputs are not finite: q = nan"),
             ("get_position", lambda: [0.1, 0.2], "ValueError"),
             ("get_velocity", lambda: 1 / 0, "ZeroDivisionError"),
-            ("set_torque", lambda: 1 / 0, "Cell.step: ZeroDivisionError"),
+            ("set_torque", lambda: 1 / 0, "CellBackend.step: ZeroDivisionError"),
         ],
     )
     def test_nonsense_from_a_client(self, published, request_name, answer, text):
