@@ -141,19 +141,32 @@ static void forget_actions(const Actions *a, size_t index) {
     }
 }
 
+/* Most values are numbers or flags, whose sizes the compiler then knows. */
+static inline void put(char *to, const char *from, size_t size) {
+    if (size == sizeof(double)) {
+        memcpy(to, from, sizeof(double));
+    } else if (size == 1) {
+        *to = *from;
+    } else {
+        memcpy(to, from, size);
+    }
+}
+
 static void start_row(const RowStart *start, const char *from, const uint32_t *starting,
                       size_t count) {
     const size_t size = start->to.size;
 
     for (size_t j = 0; j < count; j++) {
         const size_t place = starting[j] * size;
-        memcpy(start->to.data + place, from + place, size);
+        put(start->to.data + place, from + place, size);
     }
 }
 
 static void start_constant(const RowStart *start, const uint32_t *starting, size_t count) {
+    const size_t size = start->to.size;
+
     for (size_t j = 0; j < count; j++) {
-        memcpy(start->to.data + starting[j] * start->to.size, &start->from.bits, start->to.size);
+        put(start->to.data + starting[j] * size, (const char *)&start->from.bits, size);
     }
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from traceback import walk_tb
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -69,12 +69,16 @@ class ArrayHooks(Expressions):
 
     # Steps
 
-    def _play_step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> Played:
-        """See ``Expressions._play_step``; hooks tell which episodes end, so that none restarts."""
-        taken, step = self._checked(actions, fresh), cast(Any, self._play.step)
+    def _step(self, actions: Any, restart: bool) -> StepResult:
+        """See ``Expressions._step``; hooks tell which episodes end, so that none restarts."""
+        play: Any = self._play
+        fresh = self.episodes.ended.copy() if self.episodes.any_ended else None
+        is_native = play.step is not None and self.offsets is None
+        if not is_native or not (fresh is None or self._pool_starts):
+            return self._compose(actions, fresh, None)
+        taken = self._checked(actions, fresh)
         self.has_moved = True
-        played: Played = step(taken, False)
-        return played
+        return self._completed(play.step(taken, False), fresh)
 
     def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
         """See ``Expressions._checked``; the hook makes the inputs.
@@ -98,8 +102,11 @@ class ArrayHooks(Expressions):
         """See ``Expressions._completed``; the hooks that follow the FMUs' step are called."""
         env, conversions = self.env, self.env._conversions
         troubled, _, _, terminated, truncated, seen, starts = played
-        infos = {} if starts is None else self._infos_of_starts(*starts)
-        started = idle if starts is None else starts[0]
+        infos: dict[str, Any] = {}
+        started = idle
+        if starts is not None:
+            started = starts[0]
+            self._tell_starts(infos, *starts)
         self._idle = started
         if troubled:
             failed = failed_in(self._pool.statuses)

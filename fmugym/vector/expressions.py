@@ -27,7 +27,7 @@ from fmugym.vector.hooks.array_calls import (
     require_finite_start,
 )
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.infos import drawn_info, final_infos, started_info
+from fmugym.vector.infos import add_ends, add_starts
 from fmugym.vector.layout import Layout
 from fmugym.vector.step_form import prepare_step
 from fmugym.vector.tasks import StepResult, VectorTask
@@ -118,7 +118,8 @@ class Expressions(VectorTask):
             observations, infos = self._first(None, mask)
         finally:
             self.episodes.note_starts(mask)
-        return observations, infos | drawn_info(draws, drawn, mask.copy())
+        add_starts(infos, draws, self._of_all(drawn, indices), mask.copy())
+        return observations, infos
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
         """See ``VectorTask.reset_by``."""
@@ -136,7 +137,8 @@ class Expressions(VectorTask):
             self.has_moved = True
             require_started(self._pool, np.flatnonzero(mask))
         observations, infos = self._first_by_pool(seen, mask, troubled)
-        return observations, infos | started_info(self.env.episode_start, drawn, mask)
+        add_starts(infos, self.env.episode_start, drawn, mask)
+        return observations, infos
 
     def _first_by_pool(
         self, seen: Sequence[Any], mask: MaskArray, troubled: int
@@ -183,24 +185,22 @@ class Expressions(VectorTask):
 
     # Steps
 
-    def _step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> StepResult:
+    def _step(self, actions: Any, restart: bool) -> StepResult:
         """See ``VectorTask._step``; a pool that can does all of it in one call."""
-        is_native = self._play.step is not None and self.offsets is None
-        if not is_native or not (fresh is None or self._pool_starts):
-            return self._compose(actions, fresh, None)
-        return self._completed(self._play_step(actions, fresh, restart), fresh)
-
-    def _play_step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> Played:
-        """Let the pool do the whole step."""
-        at_ends = restart and self._pool_starts
         play: Any = self._play
-        step = play.step if fresh is None and not at_ends else play.start_and_step
+        any_ended = self.episodes.any_ended
+        starts = (any_ended or restart) and self._pool_starts
+        if play.step is None or self.offsets is not None or (any_ended and not starts):
+            return super()._step(actions, restart)
+        step, at_ends = play.start_and_step if starts else play.step, restart and starts
         self.has_moved = True  # unless the call refuses its arguments
         try:
             played: Played = step(actions, at_ends)
-            return played
         except _REFUSALS as error:
-            return self._play_step(self._converted(actions, error), fresh, restart)
+            converted = self._converted(actions, error)
+            self.has_moved = True
+            played = step(converted, at_ends)
+        return self._completed(played, None)
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
         """See ``VectorTask._take_actions``; what does not step counts as just started."""
@@ -249,7 +249,15 @@ class Expressions(VectorTask):
         draws, indices = self.env.episode_start, np.flatnonzero(mask)
         drawn = self.episodes.streams.draw(draws, indices)
         self.episodes.begin(indices, draws, drawn)
-        return drawn_info(draws, drawn, mask)
+        infos: dict[str, Any] = {}
+        add_starts(infos, draws, self._of_all(drawn, indices), mask)
+        return infos
+
+    def _of_all(self, drawn: FloatArray, indices: IndexArray) -> FloatArray:
+        """Values that some have drawn, shape (draws, M), in an array for all, shape (draws, N)."""
+        of_all = np.zeros((len(drawn), self._n))
+        of_all[:, indices] = drawn
+        return of_all
 
     def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
         """See ``VectorTask._conclude``."""
@@ -264,18 +272,21 @@ class Expressions(VectorTask):
         observations, infos = (seen[0], {}) if layout.is_plain else layout.parts(seen)
         if starts is not None:
             started = starts[0]
-            infos |= self._infos_of_starts(*starts)
+            self._tell_starts(infos, *starts)
         result = observations, rewards, terminated, truncated, infos
         if troubled:
             settle_faults(self.episodes, result, troubled, idle if started is None else started)
         return result
 
-    def _infos_of_starts(
-        self, started: MaskArray, drawn: FloatArray, last: Sequence[Any] | None
-    ) -> dict[str, Any]:
-        """The infos of episodes that have started in a step of the pool; see ``Play.step``."""
-        infos = started_info(self.env.episode_start, drawn, started)
-        if last is None:
-            return infos
-        observations, told = self._layout.parts(last, started)
-        return infos | final_infos(observations, told, started)
+    def _tell_starts(
+        self,
+        infos: dict[str, Any],
+        started: MaskArray,
+        drawn: FloatArray,
+        last: Sequence[Any] | None,
+    ) -> None:
+        """Add the infos of episodes that have started in a step of the pool; see ``Play.step``."""
+        add_starts(infos, self.env.episode_start, drawn, started)
+        if last is not None:
+            observations, told = self._layout.parts(last, started)
+            add_ends(infos, observations, told, started)

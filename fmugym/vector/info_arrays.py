@@ -44,7 +44,7 @@ def with_masks(values: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
     """Make infos of arrays that are zero, or None, outside of a mask already."""
     infos: dict[str, Any] = {}
     for name, value in values.items():
-        infos[name] = with_masks(value, mask) if isinstance(value, Mapping) else value
+        infos[name] = with_masks(value, mask) if type(value) is dict else value
         infos[f"_{name}"] = mask.copy()
     return infos
 

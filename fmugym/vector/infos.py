@@ -14,38 +14,34 @@ from gymnasium import spaces
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import environments_first
 from fmugym.task.episode_start import EpisodeStart
-from fmugym.task.values import LateDict
+from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.info_arrays import coded, mapped, masked
 
 __all__ = [
+    "add_ends",
+    "add_starts",
     "copy_rows",
-    "drawn_info",
-    "final_infos",
     "last_observations",
     "merged",
     "observation_of",
     "restricted",
     "rows_not_finite",
-    "started_info",
 ]
 
 
-def drawn_info(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    """The info of a reset.
+def add_starts(
+    infos: dict[str, Any], draws: EpisodeStart, drawn: FloatArray, mask: MaskArray
+) -> None:
+    """Add what infos tell of episodes that have started.
 
     Args:
+        infos: The infos.
         draws: What the environments in the mask have drawn from.
-        drawn: What they have drawn, shape (draws, M).
-        mask: The environments that were reset. No caller changes it.
+        drawn: What they have drawn, shape (draws, N), which is rarely read.
+        mask: The environments. No caller changes it.
     """
-    of_all = np.zeros((len(drawn), len(mask)))
-    of_all[:, mask] = drawn
-    return started_info(draws, of_all, mask)
-
-
-def started_info(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    """The same of values drawn for all environments, shape (draws, N)."""
-    return {"drawn": LateDict.of(_told, draws, drawn, mask), "_drawn": mask}  # rarely read
+    infos["drawn"] = LateDict({UNFILLED: (_told, draws, drawn, mask)})
+    infos["_drawn"] = mask
 
 
 def _told(draws: EpisodeStart, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
@@ -59,14 +55,19 @@ def _of_each(value: Any, count: int, kind: Any) -> Any:
     return environments_first(value) if is_drawn else np.full(count, value, kind)
 
 
-def final_infos(observations: Any, infos: Mapping[str, Any], ended: MaskArray) -> dict[str, Any]:
-    """The infos of the mode ``SAME_STEP`` on the episodes that have ended."""
-    return {
-        "final_obs": observations,
-        "_final_obs": ended.copy(),
-        "final_info": infos,
-        "_final_info": ended.copy(),
-    }
+def add_ends(
+    infos: dict[str, Any], observations: Any, told: Mapping[str, Any], ended: MaskArray
+) -> None:
+    """Add what infos of the mode ``SAME_STEP`` tell of episodes that have ended.
+
+    Args:
+        infos: The infos.
+        observations: The last observations.
+        told: The last infos.
+        ended: Which episodes have ended, shape (N,).
+    """
+    infos["final_obs"], infos["_final_obs"] = observations, ended.copy()
+    infos["final_info"], infos["_final_info"] = told, ended.copy()
 
 
 def restricted(infos: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:

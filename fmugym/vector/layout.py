@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.pool.base import MaskArray
 from fmugym.vector.hooks.task_programs import TaskPrograms
-from fmugym.vector.info_arrays import coded, mapped, with_masks
+from fmugym.vector.info_arrays import masked
 
 __all__ = ["Layout", "LayoutOfOne"]
 
@@ -30,12 +30,17 @@ class Layout:
     """
 
     def __init__(self, task: TaskPrograms, env: FMUEnv, count: int) -> None:
-        self._paths = [array.path for array in task.seen]
+        paths = [array.path for array in task.seen]
         self.shapes = tuple(((count, *array.shape), array.dtype) for array in task.seen)
         if not task.seen and env._conversions.pool_observes:
-            self._paths = [("observation",)]
+            paths = [("observation",)]
             self.shapes = (((count, env.interface.output_count), np.dtype(np.float32)),)
-        self.is_plain = self._paths == [("observation",)]
+        self.is_plain = paths == [("observation",)]
+        observed, told = (
+            [p[1:] for p in paths if p[0] == kind] for kind in ("observation", "info")
+        )
+        self._observations = _Tree(observed, 0)
+        self._infos = _Tree(told, len(observed))
         self._everywhere = np.ones(count, np.bool_)
 
     def parts(
@@ -52,21 +57,55 @@ class Layout:
         """
         if self.is_plain:
             return arrays[0], {}
-        tree = self._tree(arrays)
-        infos = tree.get("info", {})
-        told = with_masks(infos, self._everywhere) if mask is None else coded(infos, mask)
-        return tree.get("observation", {}), told
+        if mask is None:
+            return self._observations.filled(arrays), self._infos.filled(arrays, self._everywhere)
+        told = [masked(mask, array) for array in arrays]
+        return self._observations.filled(arrays), self._infos.filled(told, mask)
 
-    def _tree(self, arrays: Sequence[Any]) -> dict[str, Any]:
-        """Dicts of the arrays by their paths."""
-        tree: dict[str, Any] = {}
-        for path, array in zip(self._paths, arrays, strict=True):
-            *parents, name = path
-            place = tree
-            for parent in parents:
-                place = place.setdefault(parent, {})
-            place[name] = array
-        return tree
+
+class _Tree:
+    """Dicts of arrays, or a single array, in a list of arrays.
+
+    Args:
+        paths: The names that lead to each array; () for a single one.
+        first: The place of the first array in the list.
+    """
+
+    def __init__(self, paths: Sequence[tuple[str, ...]], first: int) -> None:
+        self._single = first if list(paths) == [()] else None
+        branches: dict[tuple[str, ...], dict[str, int]] = {(): {}}
+        for place, path in enumerate(paths, first):
+            for end in range(1, len(path)):
+                branches.setdefault(path[:end], {})
+            if path:
+                branches[path[:-1]][path[-1]] = place
+        order = sorted(branches, key=len, reverse=True)  # a dict comes after those that it has
+        self._dicts = [
+            (
+                list(branches[path].items()),
+                [(p[-1], i) for i, p in enumerate(order) if p and p[:-1] == path],
+                [f"_{p[-1]}" for p in [*paths, *order] if p and p[:-1] == path],
+            )
+            for path in order
+        ]
+
+    def filled(self, arrays: Sequence[Any], mask: MaskArray | None = None) -> Any:
+        """The dicts of these arrays; with a mask, as infos have it, for each name."""
+        if self._single is not None:
+            return arrays[self._single]
+        made: list[dict[str, Any]] = []
+        for places, branches, masks in self._dicts:
+            values = {}
+            for name, place in places:
+                values[name] = arrays[place]
+            for name, number in branches:
+                values[name] = made[number]
+            if mask is not None:
+                copy = mask.copy
+                for name in masks:
+                    values[name] = copy()
+            made.append(values)
+        return made[-1]
 
 
 class LayoutOfOne(Layout):
@@ -85,8 +124,8 @@ class LayoutOfOne(Layout):
 
     def of_one(self, arrays: Sequence[npt.NDArray[Any]]) -> tuple[Any, dict[str, Any]]:
         """The observation and the info in some arrays of these shapes, if these are not plain."""
-        tree = self._tree(arrays)
-        return mapped(_first, tree.get("observation", {})), mapped(_first, tree.get("info", {}))
+        values = [_first(array) for array in arrays]
+        return self._observations.filled(values), self._infos.filled(values)
 
 
 def _first(array: npt.NDArray[Any]) -> Any:

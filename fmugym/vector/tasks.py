@@ -14,7 +14,7 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.vector.episodes import Episodes
-from fmugym.vector.infos import final_infos, last_observations, merged, restricted
+from fmugym.vector.infos import add_ends, last_observations, merged, restricted
 
 __all__ = ["StepResult", "VectorTask", "failed_in"]
 
@@ -73,22 +73,24 @@ class VectorTask(ABC):
             resting: Which ones stay as they are, shape (N,), with a reward of 0; their episodes
                 count as ended, and none starts. None for none.
         """
-        episodes = self.episodes
-        fresh = episodes.ended.copy() if episodes.any_ended and resting is None else None
-        if resting is None:
-            result = self._step(actions, fresh, restart)
-        else:
-            result = self._compose(actions, None, resting)
-            episodes.ended |= resting
-            episodes.any_ended = True
-        return self.restarted(result) if restart and episodes.any_ended else result
+        if resting is not None:
+            return self._step_around(actions, resting)
+        result = self._step(actions, restart)
+        return self.restarted(result) if restart and self.episodes.any_ended else result
 
-    def _step(self, actions: Any, fresh: MaskArray | None, restart: bool) -> StepResult:
+    def _step_around(self, actions: Any, resting: MaskArray) -> StepResult:
+        result = self._compose(actions, None, resting)
+        self.episodes.ended |= resting
+        self.episodes.any_ended = True
+        return result
+
+    def _step(self, actions: Any, restart: bool) -> StepResult:
         """Do a step, and start the episodes that have ended before it; see ``step``.
 
         A task may start those that this step ends, too, or leave them to ``restarted``.
         """
-        return self._compose(actions, fresh, None)
+        episodes = self.episodes
+        return self._compose(actions, episodes.ended.copy() if episodes.any_ended else None, None)
 
     def _compose(
         self, actions: Any, fresh: MaskArray | None, resting: MaskArray | None
@@ -161,7 +163,7 @@ class VectorTask(ABC):
         ended, space = self.episodes.ended.copy(), self.episodes.prototype.observation_space
         last = last_observations(space, observed, ended)
         observations, infos = self.reset(ended)
-        infos |= final_infos(last, restricted(told, ended), ended)
+        add_ends(infos, last, restricted(told, ended), ended)
         if told:
             infos = merged(restricted(told, ~ended), infos)
         return observations, rewards, terminated, truncated, infos
