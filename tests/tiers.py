@@ -1,8 +1,9 @@
 """Three tiers of tests: the default run, ``slow`` tests, and ``exhaustive`` ones among these.
 
-The default run takes some three minutes on two cores. ``.ci/run`` also runs the slow tests that are
-not exhaustive, and ``.ci/full`` runs every test, as ``python -m pytest -m ""`` does. Every feature
-is in the default run: of a test with many combinations of parameters, it takes every n-th.
+The default run takes some two minutes on two cores. ``.ci/run`` also runs the slow tests that are
+not exhaustive, and ``.ci/full`` runs every test, as ``python -m pytest -m ""`` does. It has a test
+of every feature but licences, quirks of FMUs and the guess of controllers; of a test with many
+combinations of parameters, it takes every n-th.
 """
 
 SLOW_MODULES = {
@@ -13,12 +14,12 @@ SLOW_MODULES = {
     "test_cli_docs",
     "test_cli_residual",
     "test_cli_search",
-    "test_docs_tutorial",
-    "test_docs_plant",
     "test_cli_tuning",
     "test_clock_fractions",
     "test_compile",
     "test_copies",
+    "test_docs_plant",
+    "test_docs_tutorial",
     "test_events",
     "test_examples",
     "test_examples_references",
@@ -34,26 +35,29 @@ SLOW_MODULES = {
     "test_fuzz_hooks",
     "test_fuzz_systems",
     "test_fuzz_tasks",
+    "test_guessing",
     "test_keys_in_editors",
     "test_lab_programs",
+    "test_licences",
+    "test_limited_instances",
     "test_native_build",
+    "test_native_threads",
+    "test_negated_aliases",
+    "test_neighbours",
+    "test_order_of_step",
     "test_packaging",
     "test_pendulum_sim_to_lab",
+    "test_pettingzoo",
     "test_plant_opcua",
-    "test_snapshot_machine",
+    "test_process_ends",
+    "test_quirks",
+    "test_several_instances",
     "test_shared_data",
+    "test_snapshot_machine",
     "test_soak",
     "test_stand_in",
-    "test_pettingzoo",
     "test_start_times",
     "test_strings",
-    "test_value_arrays",
-    "test_value_sizes",
-    "test_value_types",
-    "test_vector_ends",
-    "test_vector_masks",
-    "test_vector_per_env_inputs",
-    "test_vector_variables",
     "test_systems",
     "test_systems_arrays",
     "test_systems_clocks",
@@ -65,6 +69,15 @@ SLOW_MODULES = {
     "test_systems_resets",
     "test_systems_ssp",
     "test_systems_strings",
+    "test_value_arrays",
+    "test_value_sizes",
+    "test_value_types",
+    "test_vector_ends",
+    "test_vector_masks",
+    "test_vector_per_env_inputs",
+    "test_vector_variables",
+    "test_wild_equations",
+    "test_zoo",
 }
 """Programs that train, build, measure, or make cases by the hundred."""
 
@@ -92,13 +105,9 @@ WITHOUT_EXTENSION = {
 EVERY = {
     "test_golden_tasks": 4,
     "test_hostile_archive": 19,
-    "test_licences": 23,
-    "test_neighbours": 7,
     "test_pool": 7,
     "test_slow_models": 7,
-    "test_quirks": 199,
     "test_words": 61,
-    "test_zoo": 199,
 }
 """By module: of each test's combinations of parameters, the default run takes every n-th."""
 
@@ -269,6 +278,20 @@ SLOW_TESTS = (
     "test_trial.py::TestSurvival::test_without_a_place",
     "test_vector_codec.py::test_gathered_as",
     "test_without_native.py::test_without_the_headers",
+    "test_search.py::TestBudget::test_steps_are_a_ceiling",
+    "test_other_makers.py::test_vector[pythonfmu",
+    "test_other_makers.py::test_who_calls_python",
+    "test_other_makers.py::test_single[pythonfmu",
+    "test_declared_rewards.py::test_what_is_too_large",
+    "test_cli.py::TestSkeleton",
+    "test_executable.py::TestMissingLibraries",
+    "test_process_border.py",
+    "test_clock_shift.py::test_a_shift",
+    "test_cli_controllers.py::test_the_actions",
+    "test_native_pool.py::TestIsolation",
+    "test_formula_programs.py::test_a_task_that_is_too_long",
+    "test_cli_names.py::test_commands_and_options",
+    "test_baselines_mpc.py::TestFailures",
 )
 """Others, by the beginning of their node ids."""
 
