@@ -23,9 +23,6 @@ Program = tuple[bytes, tuple[Array, ...]]
 def evaluate(
     program: Program,
     count: int,
-    elements: int,
-    actions: Array,
-    previous_actions: Array,
     results: tuple[Array, ...],
     seen: tuple[Array, ...],
     /,
@@ -35,9 +32,6 @@ def evaluate(
     Args:
         program: The program.
         count: The number of environments.
-        elements: The number of elements of an action.
-        actions: The actions, flat, environments first.
-        previous_actions: Those of the step before.
         results: Arrays for the results, shape (count,).
         seen: Arrays for the observations, environments first.
 
@@ -207,8 +201,8 @@ class Pool:
         start_values: Array,
         shape: tuple[int, ...],
         letter: str,
-        current: Array | None,
-        previous: Array | None,
+        current: Array,
+        previous: Array,
         draws: Draws,
         states: Array,
         step_counts: Array,

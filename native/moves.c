@@ -46,22 +46,19 @@ static const void *loaded(const Evaluation *e, const char *from, size_t step, si
     return to;
 }
 
+static char *place_in(const Evaluation *e, const Row *row) {
+    return row->data + e->begin * row->stride * row->size;
+}
+
 static const void *load_row(const Evaluation *e, const Row *row, Register *to) {
-    const char *from = row->data + e->begin * row->size;
+    const char *from = place_in(e, row);
 
     if (row->changes) { /* a later STORE_ROW must not change what was loaded */
-        memcpy(to, from, e->count * row->size);
+        copy_values(to, 1, from, row->stride, e->count, row->size);
         clear_rest(to, e->count, e->lanes, row->size);
         return to;
     }
-    return loaded(e, from, 1, row->size, to);
-}
-
-static const void *load_action(const Evaluation *e, const char *actions, size_t element,
-                               Register *to) {
-    const Source *s = e->source;
-    const char *from = actions + (e->begin * s->action_elements + element) * s->action_size;
-    return loaded(e, from, s->action_elements, s->action_size, to);
+    return loaded(e, from, row->stride, row->size, to);
 }
 
 WIDE static void find_active(const int8_t *statuses, const uint8_t *ended, size_t count,
@@ -121,7 +118,7 @@ void program_clear_seen(const Program *program, char *const *seen, size_t index)
 }
 
 static void store_row(const Evaluation *e, const Row *row, const void *values) {
-    memcpy(row->data + e->begin * row->size, values, e->count * row->size);
+    copy_values(place_in(e, row), row->stride, values, 1, e->count, row->size);
 }
 
 static char *place_of(const Evaluation *e, const Slot *slot) {
@@ -195,12 +192,6 @@ void operation_move(const Evaluation *e, Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
         *place = load_row(e, &program->rows[i.extra], to);
-        break;
-    case LOAD_ACTION:
-        *place = load_action(e, e->source->actions, i.extra, to);
-        break;
-    case LOAD_PREVIOUS_ACTION:
-        *place = load_action(e, e->source->previous_actions, i.extra, to);
         break;
     case LOAD_ACTIVE:
         *place = to;

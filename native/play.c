@@ -67,13 +67,8 @@ void play_draw(const Turn *turn, size_t index) {
 }
 
 static Source source_of(const Turn *turn) {
-    const Actions *a = &turn->play->actions;
     Source source = turn->play->source;
 
-    source.actions = a->current == NULL ? turn->actions : a->current;
-    source.previous_actions = a->previous;
-    source.action_size = a->size;
-    source.action_elements = a->elements;
     source.ended = turn->play->ended;
     source.seen = turn->seen;
     return source;
@@ -119,9 +114,7 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     const Play *play = turn->play;
     Notes notes = {.outside = false};
 
-    if (play->actions.current != NULL) {
-        take_actions(turn, begin, count);
-    }
+    take_actions(turn, begin, count);
     copy_rows(&play->before_inputs, begin, count);
     const Source source = source_of(turn);
     program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
@@ -135,10 +128,8 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 static void forget_actions(const Actions *a, size_t index) {
     const size_t size = a->elements * a->size;
 
-    if (a->current != NULL) {
-        memcpy(a->previous + index * size, a->none, size);
-        memcpy(a->current + index * size, a->none, size);
-    }
+    memcpy(a->previous + index * size, a->none, size);
+    memcpy(a->current + index * size, a->none, size);
 }
 
 /* Most values are numbers or flags, whose sizes the compiler then knows. */

@@ -23,7 +23,7 @@ typedef struct {
     size_t elements, size; /* of one environment; bytes of an element */
     ActionCheck check;
     int64_t lowest, highest;
-    char *current, *previous; /* those of this step and of the step before; NULL if not kept */
+    char *current, *previous; /* those of this step and of the step before */
     const char *none;         /* what counts as the action of an episode that starts */
 } Actions;
 

@@ -26,7 +26,6 @@ static void read_actions(Reader *reader, PlayForm *p) {
     a->check = (ActionCheck)read_integer_in(reader, ACTIONS_ANY, ACTIONS_FLOAT32);
     a->lowest = read_integer(reader);
     a->highest = read_integer(reader);
-    p->keeps_actions = read_flag(reader);
     const Block none = read_block(reader);
     const size_t checked = a->check == ACTIONS_ANY ? a->size : a->check == ACTIONS_FLOAT32 ? 4 : 8;
     if (none.size != a->elements * a->size || a->size != checked) {
@@ -42,8 +41,9 @@ static RowCopies read_copies(Reader *reader, RowCopy **memory, const Rows *rows)
 
     for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
         copies[i] = (RowCopy){row_of(reader, rows, pairs[0]), row_of(reader, rows, pairs[1])};
-        if (copies[i].from.size != copies[i].to.size) {
-            reader_refuse(reader, "rows to copy differ in type");
+        if (copies[i].from.size != copies[i].to.size || copies[i].from.stride != 1 ||
+            copies[i].to.stride != 1) {
+            reader_refuse(reader, "rows to copy differ in type, or have gaps");
         }
     }
     return (RowCopies){copies, count};
@@ -61,13 +61,13 @@ static RowStart read_start(Reader *reader, const Play *play, const Rows *rows,
         const Row from = row_of(reader, rows, numbers[2]);
         start.kind = START_ROW;
         start.from.row = from.data;
-        fits = from.size == start.to.size;
+        fits = from.size == start.to.size && from.stride == 1;
     } else {
         start.kind = START_DRAW;
         start.from.draw = (size_t)numbers[2];
         fits = start.to.size == sizeof(double) && (uint64_t)numbers[2] < draws;
     }
-    if (!fits) {
+    if (!fits || start.to.stride != 1) {
         reader_refuse(reader, "a row and its start differ in type, or there is no such draw");
     }
     return start;
@@ -97,7 +97,7 @@ static void read_program(Reader *reader, PlayForm *p, ProgramForm *program, cons
     }
     const char *fault = reader->fault;
     fault = fault == NULL ? program_take(program, form.bytes, form.size, count) : fault;
-    fault = fault == NULL ? program_settle(program, own, p->play.actions.elements) : fault;
+    fault = fault == NULL ? program_settle(program, own) : fault;
     if (fault != NULL) {
         reader_refuse(reader, fault);
     }

@@ -11,7 +11,6 @@
 typedef struct {
     Play play;
     ProgramForm inputs, conclusion;
-    bool keeps_actions; /* whether hooks read the actions of this step or of the one before */
     char *form;         /* a copy of it, which the play points to */
     RowCopy *before_inputs, *before_conclusion;
     RowStart *starts;

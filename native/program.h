@@ -35,8 +35,6 @@ enum {
 
 #define EACH_OPERATION(X)                                                                          \
     X(LOAD_ROW, "load_row")                                                                        \
-    X(LOAD_ACTION, "load_action")                                                                  \
-    X(LOAD_PREVIOUS_ACTION, "load_previous_action")                                                \
     X(LOAD_ACTIVE, "load_active")                                                                  \
     X(LOAD_STOPPED, "load_stopped")                                                                \
     X(STORE_ROW, "store_row")                                                                      \
@@ -111,8 +109,8 @@ enum { VALUE_DOUBLE, VALUE_FLOAT, VALUE_INTEGER, VALUE_FLAG, VALUE_BYTE, VALUE_T
 
 enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
 
-/* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a
- * slot, a table or a pair of types, as the operation needs it. In STORE_FLOATS, extra is the first
+/* to, a, b and c are registers. extra is the number of a row, of a slot, a table or a pair of types,
+ * as the operation needs it. In STORE_FLOATS, extra is the first
  * slot, a the first row, and b how many there are. */
 typedef struct {
     uint16_t operation, extra, to, a, b, c;
@@ -137,7 +135,8 @@ typedef struct {
 /* One value for each instance. */
 typedef struct {
     char *data;
-    size_t size;  /* bytes of a value */
+    size_t size;   /* bytes of a value */
+    size_t stride; /* values from one instance to the next: 1 unless it is an element of an array */
     bool changes; /* whether the program stores in it */
     uint32_t output; /* 1 more than the number of the output whose values these are, or 0 */
 } Row;
@@ -177,8 +176,6 @@ typedef struct {
 
 /* What changes from call to call. */
 typedef struct {
-    const char *actions, *previous_actions;
-    size_t action_size, action_elements;
     const uint8_t *ended;   /* NULL stands for none */
     const int8_t *statuses; /* NULL stands for all OK */
     char *const *seen;      /* the arrays that the slots refer to */
@@ -206,7 +203,7 @@ void program_prepare(const Program *program, Register *memory, Registers *regist
 
 /* Whether every operand refers to something that exists. The program writes and reads count
  * instances of rows that are long enough. */
-bool program_is_sound(const Program *program, size_t action_elements);
+bool program_is_sound(const Program *program);
 
 /* Sets what the program would store in the arrays of one instance to 0. */
 void program_clear_seen(const Program *program, char *const *seen, size_t index);

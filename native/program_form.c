@@ -106,9 +106,9 @@ static void note_changes(ProgramForm *p) {
     }
 }
 
-const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elements) {
+const char *program_settle(ProgramForm *p, const Row *rows) {
     memcpy(p->rows, rows, p->program.number_of_rows * sizeof *rows);
-    if (!program_is_sound(&p->program, action_elements)) {
+    if (!program_is_sound(&p->program)) {
         return UNSOUND;
     }
     if (!fill_constants(p)) {

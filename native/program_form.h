@@ -24,7 +24,7 @@ typedef struct {
  * caller must drop it in any case; settle it before it runs. */
 const char *program_take(ProgramForm *p, const void *form, size_t size, size_t number_of_rows);
 /* Takes the rows that come with the program. Returns what is wrong, or NULL. */
-const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elements);
+const char *program_settle(ProgramForm *p, const Row *rows);
 void program_drop(ProgramForm *p);
 
 #endif

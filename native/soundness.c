@@ -5,8 +5,6 @@
 static size_t number_of_operands(Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
-    case LOAD_ACTION:
-    case LOAD_PREVIOUS_ACTION:
     case LOAD_ACTIVE:
     case LOAD_STOPPED:
     case STORE_FLOATS:
@@ -55,14 +53,11 @@ static bool store_is_sound(const Program *program, Instruction i) {
     return true;
 }
 
-static bool extra_is_sound(const Program *program, size_t action_elements, Instruction i) {
+static bool extra_is_sound(const Program *program, Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
     case STORE_ROW:
         return i.extra < program->number_of_rows;
-    case LOAD_ACTION:
-    case LOAD_PREVIOUS_ACTION:
-        return i.extra < action_elements;
     case STORE_SEEN:
         return i.extra < program->number_of_slots;
     case STORE_FLOATS:
@@ -79,8 +74,8 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
     }
 }
 
-static bool instruction_is_sound(const Program *program, size_t action_elements, Instruction i) {
-    if (i.operation >= NUMBER_OF_OPERATIONS || !extra_is_sound(program, action_elements, i) ||
+static bool instruction_is_sound(const Program *program, Instruction i) {
+    if (i.operation >= NUMBER_OF_OPERATIONS || !extra_is_sound(program, i) ||
         i.to >= program->registers) {
         return false;
     }
@@ -115,12 +110,12 @@ static bool slots_are_sound(const Program *program) {
     return true;
 }
 
-bool program_is_sound(const Program *program, size_t action_elements) {
+bool program_is_sound(const Program *program) {
     if (program->registers > PROGRAM_REGISTERS || !slots_are_sound(program)) {
         return false;
     }
     for (size_t i = 0; i < program->length; i++) {
-        if (!instruction_is_sound(program, action_elements, program->code[i])) {
+        if (!instruction_is_sound(program, program->code[i])) {
             return false;
         }
     }

@@ -155,7 +155,7 @@ class _Compiler:
             case "row":
                 return "load_row", self._place(self._rows, what)
             case "action" | "previous_action":
-                return f"load_{node.kind}", what
+                return "load_row", self._place(self._rows, (node.kind, what))
             case "active" | "stopped":
                 return f"load_{node.kind}", 0
             case "take" | "interpolate":

@@ -43,7 +43,7 @@ _FUNCTIONS: Final = (
 """Functions of the C library, whose last bits may differ from numpy's."""
 
 OPERATIONS: Final = (
-    *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
+    *("load_row", "load_active", "load_stopped"),
     *("store_row", "store_seen", "store_floats", "cast", "take", "interpolate"),
     *(f"{name} {letter}" for letter in "dfq" for name in _OF_EACH_TYPE),
     *(f"{name} {letter}" for name in ("divide", "absolute", "sqrt") for letter in "df"),

@@ -299,7 +299,7 @@ def prepare(
         actions: How actions are checked and kept: the shape of one action; the letter of its
             type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
             from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
-            actions of this step and of the one before (or None), flat, environments first;
+            actions of this step and of the one before, flat, environments first;
             what counts as the action of a new episode.
         start_values: As the values of ``reset``; the pool writes the draws there.
         draws: The draws of an episode, and the random streams, shape (N, 6); see

@@ -63,7 +63,7 @@ def form_of_play(
     number, none = rows.number, actions["none"]
     writer = Writer().integers(surroundings["reads_kept"], limit, none.size)
     writer.integers(*(actions[name] for name in ("size", "check", "lowest", "highest")))
-    writer.integers(actions["current"] is not None).block(none.tobytes())
+    writer.block(none.tobytes())
     for moment in ("before_inputs", "before_conclusion"):
         pairs = surroundings[moment]
         writer.array([[number(source), number(to)] for source, to in pairs], np.int64)

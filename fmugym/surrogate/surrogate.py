@@ -104,7 +104,6 @@ class Surrogate:
         factors: FloatArray = np.zeros((self.terms.factor_count, count))
         repeated = np.repeat(np.reshape(numbers, (-1, 1)), count, axis=1)
         arrays: dict[str, Any] = {"x": rows, "factor": factors, "number": repeated, "next": after}
-        nothing = np.zeros(count)
 
         def find(row: Any) -> FloatArray:
             name, place = row
@@ -115,7 +114,7 @@ class Surrogate:
 
         def run() -> None:
             for one in parts:
-                engine().evaluate(one, count, 1, nothing, nothing, (), ())
+                engine().evaluate(one, count, (), ())
 
         return run
 

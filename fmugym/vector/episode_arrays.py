@@ -95,6 +95,9 @@ class EpisodeArrays:
                 return self.given[index]
             case "step_count":
                 return self.quantities.step_count
+            case "action" | "previous_action":
+                actions = self.actions[kind == "previous_action"]
+                return actions.reshape(self._n, -1)[:, index]
             case str() if kind in PREVIOUS:
                 return element_row(getattr(self.quantities, kind), index)
         arrays = self.variables if kind == "variable" else self.before

@@ -73,19 +73,18 @@ class _Tree:
 
     def __init__(self, paths: Sequence[tuple[str, ...]], first: int) -> None:
         self._single = first if list(paths) == [()] else None
-        branches: dict[tuple[str, ...], dict[str, int]] = {(): {}}
+        entries: dict[tuple[str, ...], dict[str, int | None]] = {(): {}}
         for place, path in enumerate(paths, first):
-            for end in range(1, len(path)):
-                branches.setdefault(path[:end], {})
-            if path:
-                branches[path[:-1]][path[-1]] = place
-        order = sorted(branches, key=len, reverse=True)  # a dict comes after those that it has
+            for end in range(len(path)):
+                own = entries.setdefault(path[:end], {})
+                own.setdefault(path[end], None if end + 1 < len(path) else place)
+        order = sorted(entries, key=len, reverse=True)  # a dict comes after those that it has
+        numbers = {path: number for number, path in enumerate(order)}
         self._dicts = [
-            (
-                list(branches[path].items()),
-                [(p[-1], i) for i, p in enumerate(order) if p and p[:-1] == path],
-                [f"_{p[-1]}" for p in [*paths, *order] if p and p[:-1] == path],
-            )
+            [
+                (name, f"_{name}", place, numbers.get((*path, name), 0))
+                for name, place in entries[path].items()
+            ]
             for path in order
         ]
 
@@ -94,16 +93,12 @@ class _Tree:
         if self._single is not None:
             return arrays[self._single]
         made: list[dict[str, Any]] = []
-        for places, branches, masks in self._dicts:
-            values = {}
-            for name, place in places:
-                values[name] = arrays[place]
-            for name, number in branches:
-                values[name] = made[number]
-            if mask is not None:
-                copy = mask.copy
-                for name in masks:
-                    values[name] = copy()
+        for entries in self._dicts:
+            values: dict[str, Any] = {}
+            for name, name_of_mask, place, number in entries:
+                values[name] = made[number] if place is None else arrays[place]
+                if mask is not None:
+                    values[name_of_mask] = mask.copy()
             made.append(values)
         return made[-1]
 

@@ -141,9 +141,8 @@ static bool take_actions(PyPool *self, Playing *playing, const Parts *p) {
 
     playing->action_letter = p->letter;
     return take_shape(self, playing, p->shape) &&
-           (!playing->form.keeps_actions ||
-            (take_kept_actions(self, playing, p->current, CURRENT, &a->current) &&
-             take_kept_actions(self, playing, p->previous, PREVIOUS, &a->previous)));
+           take_kept_actions(self, playing, p->current, CURRENT, &a->current) &&
+           take_kept_actions(self, playing, p->previous, PREVIOUS, &a->previous);
 }
 
 /* Nobody asks for done later if it is None. */

@@ -19,15 +19,21 @@ bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char 
     return false;
 }
 
+/* A row may be an element of an array that has the instances on its first axis. */
 static bool take_row(PyObject *object, Py_ssize_t length, Py_buffer *buffer, Row *row) {
-    if (!take_numbers(object, buffer, true, "a row of a program", length)) {
+    if (PyObject_GetBuffer(object, buffer, PyBUF_STRIDES | PyBUF_FORMAT | PyBUF_WRITABLE) < 0) {
         return false;
     }
-    if ((uintptr_t)buffer->buf % (uintptr_t)buffer->itemsize != 0) {
+    if (buffer->ndim != 1 || buffer->shape[0] != length || buffer->itemsize > 8) {
+        PyErr_Format(PyExc_ValueError, "a row of a program must be a vector of %zd numbers", length);
+        return false;
+    }
+    const Py_ssize_t size = buffer->itemsize, stride = length > 1 ? buffer->strides[0] : size;
+    if ((uintptr_t)buffer->buf % (uintptr_t)size != 0 || stride < size || stride % size != 0) {
         PyErr_SetString(PyExc_ValueError, "a row of a program is not aligned");
         return false;
     }
-    *row = (Row){.data = buffer->buf, .size = (size_t)buffer->itemsize};
+    *row = (Row){.data = buffer->buf, .size = (size_t)size, .stride = (size_t)(stride / size)};
     return true;
 }
 
@@ -109,7 +115,7 @@ bool take_seen(const ProgramForm *program, size_t count, PyObject *arrays, Py_bu
 
 /* Evaluating a program alone */
 
-enum { ACTIONS_GIVEN, PREVIOUS_GIVEN, FIRST_RESULT, FIRST_SEEN = FIRST_RESULT + PROGRAM_RESULTS };
+enum { FIRST_SEEN = PROGRAM_RESULTS }; /* among buffers; those of results come first */
 
 typedef struct {
     ProgramForm program;
@@ -131,30 +137,12 @@ static bool take_program(Evaluation *e, PyObject *parts) {
     }
     const char *fault = program_take(&e->program, form, (size_t)size, e->rows.count);
     if (fault == NULL) {
-        fault = program_settle(&e->program, e->rows.rows, e->source.action_elements);
+        fault = program_settle(&e->program, e->rows.rows);
     }
     if (fault != NULL) {
         PyErr_Format(PyExc_ValueError, "a program is not sound: %s", fault);
     }
     return fault == NULL;
-}
-
-static bool take_given(Evaluation *e, PyObject *actions, PyObject *previous) {
-    Py_buffer *b = e->buffers;
-    const Py_ssize_t length = (Py_ssize_t)(e->count * e->source.action_elements);
-
-    if (!take_numbers(actions, &b[ACTIONS_GIVEN], false, "actions", length) ||
-        !take_numbers(previous, &b[PREVIOUS_GIVEN], false, "previous actions", length)) {
-        return false;
-    }
-    e->source.actions = b[ACTIONS_GIVEN].buf;
-    e->source.previous_actions = b[PREVIOUS_GIVEN].buf;
-    e->source.action_size = (size_t)b[ACTIONS_GIVEN].itemsize;
-    if (b[PREVIOUS_GIVEN].itemsize != b[ACTIONS_GIVEN].itemsize) {
-        PyErr_SetString(PyExc_ValueError, "actions and previous actions differ in type");
-        return false;
-    }
-    return true;
 }
 
 static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
@@ -165,7 +153,7 @@ static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
         return false;
     }
     for (size_t i = 0; i < wanted; i++) {
-        if (!take_numbers(PyTuple_GetItem(results, (Py_ssize_t)i), &e->buffers[FIRST_RESULT + i],
+        if (!take_numbers(PyTuple_GetItem(results, (Py_ssize_t)i), &e->buffers[i],
                           true, "a result", (Py_ssize_t)e->count)) {
             return false;
         }
@@ -186,7 +174,7 @@ static bool evaluate(Evaluation *e) {
         const size_t count = rest < PROGRAM_WIDTH ? rest : PROGRAM_WIDTH;
         program_run(program, &e->source, begin, count, &registers, &notes);
         for (size_t i = 0; i < program->number_of_results; i++) {
-            const Py_buffer *b = &e->buffers[FIRST_RESULT + i];
+            const Py_buffer *b = &e->buffers[i];
             const size_t size = (size_t)b->itemsize;
             memcpy((char *)b->buf + begin * size, registers.places[program->results[i]],
                    count * size);
@@ -196,20 +184,18 @@ static bool evaluate(Evaluation *e) {
 }
 
 PyObject *py_evaluate(PyObject *module, PyObject *args) {
-    PyObject *parts, *actions, *previous, *results, *seen, *result = NULL;
-    Py_ssize_t count, elements;
+    PyObject *parts, *results, *seen, *result = NULL;
+    Py_ssize_t count;
     Evaluation *e = calloc(1, sizeof *e);
 
     (void)module;
     if (e == NULL) {
         return PyErr_NoMemory();
     }
-    if (PyArg_ParseTuple(args, "OnnOOO!O!:evaluate", &parts, &count, &elements, &actions,
-                         &previous, &PyTuple_Type, &results, &PyTuple_Type, &seen)) {
+    if (PyArg_ParseTuple(args, "OnO!O!:evaluate", &parts, &count, &PyTuple_Type, &results,
+                         &PyTuple_Type, &seen)) {
         e->count = (size_t)count;
-        e->source.action_elements = (size_t)elements;
-        if (take_program(e, parts) &&
-            take_given(e, actions, previous) && take_outputs(e, results, seen)) {
+        if (take_program(e, parts) && take_outputs(e, results, seen)) {
             result = PyBool_FromLong(evaluate(e));
         }
     }

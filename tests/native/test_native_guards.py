@@ -11,7 +11,7 @@ import pytest
 import zoo_tools
 from combinations import in_turn
 from process_tools import run_python
-from program_tools import DISCRETE, code, results_of, uniform_draws
+from program_tools import DISCRETE, code, kept_actions, results_of, uniform_draws
 from test_native_pool import LOG, make, on_linux
 from ways import in_way
 
@@ -222,7 +222,7 @@ def prepare(pool, inputs, conclusion=None, rows=(0,), draws=None, **changes):
     return pool.prepare_play(
         (pool.variable("theta_0"),),
         (inputs, conclusion or program(results=(0, 0, 0))),
-        DISCRETE | changes.pop("actions", {}),
+        DISCRETE | kept_actions(n) | changes.pop("actions", {}),
         np.zeros((1, n)),
         draws or (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
         (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
@@ -230,18 +230,18 @@ def prepare(pool, inputs, conclusion=None, rows=(0,), draws=None, **changes):
     )
 
 
-ACTION = ("load_action",)
+ACTIVE = ("load_active",)
 
 
 class TestPrograms:
     def test_a_sound_one(self, cart_poles):
-        prepare(cart_poles, program(ACTION))
+        prepare(cart_poles, program(ACTIVE))
 
     @pytest.mark.parametrize(
         "row",
         [
-            ("load_action", 1),
-            ("load_previous_action", 60000),
+            ("load_active", 1),
+            ("load_stopped", 60000),
             ("load_row", 0, 1),
             ("store_row", 0, 0, 1),
             ("store_seen", 0, 0, 1),
@@ -260,7 +260,7 @@ class TestPrograms:
     )
     def test_operands_that_an_operation_does_not_have(self, cart_poles, row):
         with pytest.raises(ValueError, match="the form of a play is damaged"):
-            prepare(cart_poles, program(ACTION, row))
+            prepare(cart_poles, program(ACTIVE, row))
 
     @pytest.mark.parametrize(
         "changes",
@@ -284,18 +284,18 @@ class TestPrograms:
     )
     def test_parts_that_do_not_fit(self, cart_poles, changes):
         with pytest.raises(ValueError, match="the form of a play is damaged"):
-            prepare(cart_poles, program(ACTION, **changes))
+            prepare(cart_poles, program(ACTIVE, **changes))
 
     @pytest.mark.parametrize(
         ("table", "name"), [(np.zeros(0), "take"), (np.zeros(5), "interpolate")]
     )
     def test_tables_that_are_too_short(self, cart_poles, table, name):
         with pytest.raises(ValueError, match="the form of a play is damaged"):
-            prepare(cart_poles, program(ACTION, (name, 0, 1), tables=(table,)))
+            prepare(cart_poles, program(ACTIVE, (name, 0, 1), tables=(table,)))
 
     def test_rows_of_another_length(self, cart_poles):
         with pytest.raises(ValueError, match="a row of a program must be a vector of"):
-            prepare(cart_poles, program(ACTION, numbers=(np.zeros(1),)))
+            prepare(cart_poles, program(ACTIVE, numbers=(np.zeros(1),)))
 
     @pytest.mark.parametrize(
         "actions",
@@ -309,7 +309,7 @@ class TestPrograms:
     )
     def test_actions_that_do_not_fit(self, cart_poles, actions):
         with pytest.raises(ValueError, match="action"):
-            prepare(cart_poles, program(ACTION), actions=actions)
+            prepare(cart_poles, program(ACTIVE), actions=actions)
 
     @pytest.mark.parametrize(
         "changes",
@@ -328,20 +328,20 @@ class TestPrograms:
     )
     def test_surroundings_that_do_not_fit(self, cart_poles, changes):
         with pytest.raises((TypeError, ValueError), match=r"must|differ|fit|float64"):
-            prepare(cart_poles, program(ACTION), **changes)
+            prepare(cart_poles, program(ACTIVE), **changes)
 
     @pytest.mark.parametrize("row", [1, 2**40])
     def test_rows_beyond_the_start_values(self, cart_poles, row):
         """They say where in memory draws are written."""
-        prepare(cart_poles, program(ACTION), rows=(0, -1))
+        prepare(cart_poles, program(ACTIVE), rows=(0, -1))
         with pytest.raises(ValueError, match="a draw is for no start value"):
-            prepare(cart_poles, program(ACTION), rows=(row,))
+            prepare(cart_poles, program(ACTIVE), rows=(row,))
 
     def test_what_does_not_hold_draws(self, cart_poles):
         draws, states = uniform_draws(0), np.zeros((6, 6), np.uint64)
         for odd in ((draws, states[:, :5]), (draws, states.view(np.int64)), (b"", states)):
             with pytest.raises((TypeError, ValueError)):
-                prepare(cart_poles, program(ACTION), draws=odd)
+                prepare(cart_poles, program(ACTIVE), draws=odd)
 
 
 # Memory

@@ -209,17 +209,17 @@ def program_form(rng):
 
     def play():
         with refusals():
-            _native.evaluate((form, arrays), n, 1, np.ones(n), np.ones(n), results, (seen,))
+            _native.evaluate((form, arrays), n, results, (seen,))
 
     return Case(play, "program")
 
 
 def play_of(inputs, outputs):
     """The parts of a play: it passes the action on, and ends beyond an output of 1."""
-    push = code(("load_action", 0, 0), ("store_row", 0, 0, 0))
+    push, kept_actions = code(("load_row", 1, 0), ("store_row", 0, 0, 0)), np.zeros(N)
     judge = code(("load_row", 0, 1), ("greater d", 0, 2, 1, 0))
     programs = (
-        (form_of_program(push, b"", b"", (), 1, 0, ()), (inputs[0],)),
+        (form_of_program(push, b"", b"", (), 1, 0, ()), (inputs[0], kept_actions)),
         (form_of_program(judge, constants(1.0), b"", (), 3, 0, (2, 2, 1)), (outputs[0],)),
     )
     kept, variables = np.zeros_like(outputs), np.zeros((2, N))
@@ -243,7 +243,7 @@ def play_of(inputs, outputs):
         "check": 2,
         "lowest": 0,
         "highest": 0,
-        "current": np.zeros(N),
+        "current": kept_actions,
         "previous": np.zeros(N),
         "none": np.zeros(1),
     }

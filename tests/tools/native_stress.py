@@ -30,7 +30,14 @@ from pathlib import Path
 
 import numpy as np
 from exchange_tools import exchange_fmu
-from program_tools import DISCRETE, code, constants, results_of, uniform_draws
+from program_tools import (
+    DISCRETE,
+    code,
+    constants,
+    kept_actions,
+    results_of,
+    uniform_draws,
+)
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.expressions.program import TYPES
@@ -48,10 +55,10 @@ ending = threading.Event()
 """Set when the interpreter is about to end: receivers are silent then, and temporary files go."""
 
 
-def programs(pool, variables):
+def programs(pool, variables, actions):
     """Programs that use the numbers of the pool, those from before, and the C library."""
     push = code(
-        ("load_action", 0, 1),
+        ("load_row", 1, 1),
         ("cast", 2 * len(TYPES), 2, 1),
         ("multiply d", 0, 3, 2, 0),
         ("store_row", 0, 0, 3),
@@ -61,13 +68,13 @@ def programs(pool, variables):
         ("sin d", 0, 3, 2),
         ("absolute d", 0, 4, 3),
         ("greater d", 0, 5, 4, 0),
-        ("load_previous_action", 0, 6),
+        ("load_row", 2, 6),
         ("store_row", 1, 0, 4),
     )
-    rows = pool.outputs[0], variables[0]
+    rows = pool.outputs[0], variables[0], actions["previous"]
     pushing = form_of_program(push, constants(3.0), b"", (), 4, 0, ())
     judging = form_of_program(judge, constants(0.2, 0.0), b"", (), 7, 0, (5, 1, 4))
-    return (pushing, (pool.inputs[0],)), (judging, rows)
+    return (pushing, (pool.inputs[0], actions["current"])), (judging, rows)
 
 
 DRAWS = uniform_draws(0)
@@ -149,10 +156,11 @@ class Subject:
 
     def prepare_play(self):
         variables, before = np.zeros((1, self.n)), np.zeros((1, self.n))
+        actions = kept_actions(self.n)
         self.pool.prepare_play(
             self.start,
-            programs(self.pool, variables),
-            DISCRETE | {"current": np.zeros(self.n, "i8"), "previous": np.zeros(self.n, "i8")},
+            programs(self.pool, variables, actions),
+            DISCRETE | actions,
             self.values.copy(),
             (DRAWS, self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)),
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),

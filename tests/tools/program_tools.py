@@ -13,11 +13,14 @@ DISCRETE = {
     "check": 1,
     "lowest": 0,
     "highest": 1,
-    "current": None,
-    "previous": None,
     "none": np.zeros(1, np.int64),
 }
 """Actions that are 0 or 1."""
+
+
+def kept_actions(count):
+    """Memory for the actions of a step, and of the one before."""
+    return {"current": np.zeros(count, np.int64), "previous": np.zeros(count, np.int64)}
 
 
 def code(*rows):

@@ -34,7 +34,7 @@ def begun(envs, steps=2):
     for seed in range(0, 1000, N):
         envs.reset(seed=seed)
         results = [envs.step(action) for action in actions[:steps]]
-        if not any((result.terminated | result.truncated).any() for result in results):
+        if not any((result[2] | result[3]).any() for result in results):
             break
     return actions[steps:].swapaxes(0, 1)
 
