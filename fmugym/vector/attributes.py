@@ -158,7 +158,7 @@ class Attributes:
                 self._prototype.interface.within(variable, value)
         for variable, column in columns.items():
             self._episodes.set_parameter(variable.name, column)
-        self._task.settle()
+        self._task.rebind()
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute, or an episode variable, of some environments.

@@ -46,7 +46,6 @@ class Expressions(VectorTask):
 
     Args:
         env: The prototype, made with a pool of N instances.
-        num_envs: N.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
         programs: Those of the expressions.
     """
@@ -60,8 +59,8 @@ class Expressions(VectorTask):
         self._limit = min(env.step_limit, max_episode_steps or sys.maxsize)
         self._prepare(programs)
 
-    def settle(self) -> None:
-        """See ``VectorTask.settle``."""
+    def rebind(self) -> None:
+        """See ``VectorTask.rebind``."""
         self._prepare(self._programs)
 
     def _prepare(self, programs: TaskPrograms) -> None:
@@ -197,9 +196,7 @@ class Expressions(VectorTask):
         try:
             played: Played = step(actions, at_ends)
         except _REFUSALS as error:
-            converted = self._converted(actions, error)
-            self.has_moved = True
-            played = step(converted, at_ends)
+            return self._step(self._converted(actions, error), restart)
         return self._completed(played, None)
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:

@@ -1,7 +1,5 @@
 """The step of a native pool in one call equals the step of its parts, over every kind of pool."""
 
-import types
-
 import numpy as np
 import pytest
 from fmu_tools import probe_config
@@ -9,7 +7,6 @@ from vector_tools import require_equal, require_same_infos
 
 from fmugym import Choice, FMI2CSEnv, Uniform, bundled_fmu
 from fmugym.envs import CartPoleEnv, HouseEnv
-from fmugym.vector.tasks import VectorTask
 
 COUNT, STEPS = 5, 120
 PENDULUM = {
@@ -65,8 +62,8 @@ OTHERS = {"x_0": 0.01, "T_m_0": 290.0, "theta_0": 2.0, "fault": 0}
 
 
 def composed(envs):
-    """Let a native pool step as all others do: of its parts."""
-    envs.task._step = types.MethodType(VectorTask._step, envs.task)
+    """Let a native pool step as all others do, of its parts: it adds no offsets by itself."""
+    envs.task.offsets = np.zeros(len(envs.pool.outputs))
 
 
 POOLS = {

@@ -15,7 +15,7 @@ from vector_tools import (
     results_of_both,
     sampled_actions,
 )
-from ways import in_way, make_vec
+from ways import ALL_WAYS, in_way, make_vec
 
 from fmugym import ConfigError
 
@@ -56,12 +56,13 @@ def test_a_bad_action_is_forgotten():
     theirs.close()
 
 
-@each_way
-def test_an_action_that_does_not_fit_changes_nothing(hooks, make_envs):
+@pytest.mark.parametrize("given", [np.array, list, np.int16])
+@pytest.mark.parametrize("hooks", ALL_WAYS)
+def test_an_action_that_does_not_fit_changes_nothing(hooks, given, make_envs):
     vector = make_envs(in_way(hooks, CART_POLE), 3)
     first = vector.reset(seed=0)[0]
     with pytest.raises(ConfigError, match=r"environment 2.* is not in Discrete"):
-        vector.step(np.array([0, 1, 7]))
+        vector.step(given([0, 1, 7]))
     assert vector.get_attr("step_count") == (0, 0, 0)
     assert vector.get_attr("action") == (0, 0, 0)
     np.testing.assert_array_equal(np.array(vector.get_attr("state"), np.float32), first)

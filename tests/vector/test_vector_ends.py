@@ -300,7 +300,7 @@ def with_failing(task, monkeypatch):
         return play._replace(start_and_step=made_of[-1])
 
     monkeypatch.setattr(envs.pool, "prepare_play", prepared)
-    envs.task.settle()
+    envs.task.rebind()
     envs.reset(seed=0)
     return envs, made_of[-1]
 

@@ -200,5 +200,5 @@ def require_refused(results, monkeypatch, *, refused=True):
 
     monkeypatch.setattr(envs.pool, "prepare_play", with_others)
     with pytest.raises((TypeError, ValueError)) if refused else contextlib.nullcontext():
-        envs.task.settle()
+        envs.task.rebind()
     envs.close()
