@@ -31,6 +31,7 @@ from tables import Table, duration, times
 import fmugym
 from fmugym.expressions.program import OPERATIONS, is_function
 from fmugym.task.interface import resolve
+from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 
 __all__ = ["TASKS", "Task", "fmugym_run", "tables"]
 
@@ -133,11 +134,12 @@ def _allowed_each(task: Task) -> float | None:
     None if the task has hooks.
     """
     with ExitStack() as stack:
-        engine = _fmugym(stack, task, 1).engine
-    if not engine.has_expressions_only:
-        return None
-    programs = engine._task
-    codes = np.concatenate([programs.inputs.code[:, 0], programs.judgement.code[:, 0]])
+        env = _fmugym(stack, task, 1).prototype
+        formulas = formulas_of(env)
+        if formulas is None:
+            return None
+        programs = compile_formulas(env, formulas)
+    codes = np.concatenate([programs.inputs.code[:, 0], programs.conclusion.code[:, 0]])
     names = [OPERATIONS[code] for code in codes.tolist()]
     return 1e-9 * (10.0 + sum(map(_allowed, names)))
 

@@ -65,7 +65,8 @@ static RowStart read_start(Reader *reader, const Play *play, const Rows *rows,
     } else {
         start.kind = START_DRAW;
         start.from.draw = (size_t)numbers[2];
-        fits = start.to.size == sizeof(double) && (uint64_t)numbers[2] < draws;
+        fits = numbers[1] == START_DRAW && start.to.size == sizeof(double) &&
+               (uint64_t)numbers[2] < draws;
     }
     if (!fits || start.to.stride != 1) {
         reader_refuse(reader, "a row and its start differ in type, or there is no such draw");

@@ -16,8 +16,8 @@ typedef struct {
     RowStart *starts;
 } PlayForm;
 
-/* Reads the form of a play, which names rows by their numbers among these. The caller has set the start
- * values with their number, and the draws, if there are any. Returns what is wrong, or NULL. The caller
+/* Reads the form of a play, which names rows by their numbers among these. The caller has set the
+ * draws, if there are any. Returns what is wrong, or NULL. The caller
  * must drop the play in any case. */
 const char *play_take(PlayForm *p, const Settings *settings, const void *form, size_t size,
                       const Row *rows, size_t number_of_rows);

@@ -1,7 +1,7 @@
 """Forms that open a pool of the C extension, as bytes.
 
 ``NativePool`` hands the bytes to the C extension of this process, and ``ProcessPool`` to those of
-its workers. ``native/form.c`` reads all of them, in the same order.
+its workers. ``native/pool_form.c`` and ``native/program_form.c`` read them, in the same order.
 
 A form is a row of numbers of 8 bytes: integers, flags and floating-point numbers. A block has its
 size before it, and zeros after it up to the next multiple of 8. A text is a block that ends with a

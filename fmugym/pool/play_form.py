@@ -31,17 +31,17 @@ class Rows:
 
     def __init__(self, rows: Iterable[_Row] = ()) -> None:
         self.arrays: list[_Row] = []
-        self._numbers: dict[int, int] = {}
+        self._numbers: dict[Any, int] = {}
         for row in rows:
             self.number(row)
 
     def number(self, row: _Row) -> int:
         """The number of the memory of a row, which gets one if it has none."""
-        address = row.__array_interface__["data"][0]
-        if address not in self._numbers:
-            self._numbers[address] = len(self.arrays)
+        memory = row.__array_interface__["data"][0], row.strides, row.dtype
+        if memory not in self._numbers:
+            self._numbers[memory] = len(self.arrays)
             self.arrays.append(row)
-        return self._numbers[address]
+        return self._numbers[memory]
 
 
 def form_of_play(

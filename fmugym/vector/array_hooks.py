@@ -55,7 +55,6 @@ class ArrayHooks(Expressions):
         self, seen: Sequence[Any], mask: MaskArray, troubled: int
     ) -> tuple[Any, dict[str, Any]]:
         """See ``Expressions._first_by_pool``."""
-        self.has_moved = True
         is_there = self.env._conversions.pool_observes
         return self._first(self._layout.parts(seen)[0] if is_there else None, mask)
 
@@ -78,7 +77,8 @@ class ArrayHooks(Expressions):
             return self._compose(actions, fresh, None)
         taken = self._checked(actions, fresh)
         self.has_moved = True
-        return self._completed(play.step(taken, False), fresh)
+        step = play.step if fresh is None else play.start_and_step
+        return self._completed(step(taken, False), fresh)
 
     def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
         """See ``Expressions._checked``; the hook makes the inputs.

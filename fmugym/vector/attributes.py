@@ -156,9 +156,11 @@ class Attributes:
         for variable, column in columns.items():
             for value in column.tolist():
                 self._prototype.interface.within(variable, value)
-        for variable, column in columns.items():
-            self._episodes.set_parameter(variable.name, column)
-        self._task.rebind()
+        try:
+            for variable, column in columns.items():
+                self._episodes.set_parameter(variable.name, column)
+        finally:
+            self._task.rebind()
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute, or an episode variable, of some environments.

@@ -131,9 +131,9 @@ class Expressions(VectorTask):
             raise
         if done is None:
             return None
+        self.has_moved = True
         troubled, self.episodes.any_ended, seen, mask, drawn = done
         if troubled:
-            self.has_moved = True
             require_started(self._pool, np.flatnonzero(mask))
         observations, infos = self._first_by_pool(seen, mask, troubled)
         add_starts(infos, self.env.episode_start, drawn, mask)

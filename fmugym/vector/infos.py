@@ -14,7 +14,7 @@ from gymnasium import spaces
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import environments_first
 from fmugym.task.episode_start import EpisodeStart
-from fmugym.task.values import UNFILLED, LateDict
+from fmugym.task.values import LateDict
 from fmugym.vector.info_arrays import coded, mapped, masked
 
 __all__ = [
@@ -40,7 +40,7 @@ def add_starts(
         drawn: What they have drawn, shape (draws, N), which is rarely read.
         mask: The environments. No caller changes it.
     """
-    infos["drawn"] = LateDict({UNFILLED: (_told, draws, drawn, mask)})
+    infos["drawn"] = LateDict.of(_told, draws, drawn, mask)
     infos["_drawn"] = mask
 
 

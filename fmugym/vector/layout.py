@@ -40,6 +40,7 @@ class Layout:
             [p[1:] for p in paths if p[0] == kind] for kind in ("observation", "info")
         )
         self._observations = _Tree(observed, 0)
+        self._first_info = len(observed)
         self._infos = _Tree(told, len(observed))
         self._everywhere = np.ones(count, np.bool_)
 
@@ -59,8 +60,9 @@ class Layout:
             return arrays[0], {}
         if mask is None:
             return self._observations.filled(arrays), self._infos.filled(arrays, self._everywhere)
-        told = [masked(mask, array) for array in arrays]
-        return self._observations.filled(arrays), self._infos.filled(told, mask)
+        told = [masked(mask, array) for array in arrays[self._first_info :]]
+        observations = self._observations.filled(arrays)
+        return observations, self._infos.filled([*arrays[: self._first_info], *told], mask)
 
 
 class _Tree:

@@ -71,7 +71,7 @@ class VectorTask(ABC):
             restart: Whether an episode that this step ends is followed by the next one at once.
                 Otherwise the next step starts that one, and does not step its FMU.
             resting: Which ones stay as they are, shape (N,), with a reward of 0; their episodes
-                count as ended, and none starts. None for none.
+                count as ended, and no episode starts. None for none.
         """
         if resting is not None:
             return self._step_around(actions, resting)
@@ -162,7 +162,10 @@ class VectorTask(ABC):
         observed, rewards, terminated, truncated, told = result
         ended, space = self.episodes.ended.copy(), self.episodes.prototype.observation_space
         last = last_observations(space, observed, ended)
-        observations, infos = self.reset(ended)
+        try:
+            observations, infos = self.reset(ended)
+        finally:
+            self.has_moved = True  # in the step
         add_ends(infos, last, restricted(told, ended), ended)
         if told:
             infos = merged(restricted(told, ~ended), infos)

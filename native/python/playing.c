@@ -135,7 +135,7 @@ static bool take_kept_actions(PyPool *self, Playing *playing, PyObject *object, 
     return (size_t)buffer->itemsize == a->size;
 }
 
-/* Actions that are kept need memory for this step and for the one before. */
+/* The memory is that for the actions of this step, and of the one before. */
 static bool take_actions(PyPool *self, Playing *playing, const Parts *p) {
     Actions *a = &playing->form.play.actions;
 
