@@ -524,12 +524,13 @@ class FMU(KnownArguments):
 
     def close(self) -> None:
         """Remove the temporary folder; more than one call is fine."""
-        self._folder = None
-        finalizer = self._remove_folder
-        if finalizer is not None and (alive := finalizer.peek()) is not None:
-            _, remove, arguments, _ = alive
-            remove(*arguments)
-            finalizer.detach()  # not before: a signal may have interrupted the removal
+        with _extracting:
+            self._folder = None
+            finalizer = self._remove_folder
+            if finalizer is not None and (alive := finalizer.peek()) is not None:
+                _, remove, arguments, _ = alive
+                remove(*arguments)
+                finalizer.detach()  # not before: a signal may have interrupted the removal
 
 
 def _is_missing(folder: Path, target: str) -> bool:

@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+import threading
 from pathlib import Path
 
 import fmu_tools
@@ -69,6 +70,24 @@ def test_the_folder_goes(tmp_path, use, name):
     assert is_plain_path(folder)
     assert (folder.stat().st_mode & 0o077) == 0
     fmu.close()
+    assert not folder.exists()
+
+
+def test_nobody_removes_it_while_files_are_extracted(tmp_path, monkeypatch):
+    """Several threads may use one FMU, of which one closes it."""
+    fmu, alive = FMU(resource_fmu(tmp_path, 2)), []
+    closing, extract_to = threading.Thread(target=fmu.close), fmu._extract_to
+
+    def slow(folder, only=""):
+        closing.start()
+        closing.join(0.2)
+        alive.append(closing.is_alive())
+        return extract_to(folder, only)
+
+    monkeypatch.setattr(fmu, "_extract_to", slow)
+    folder = fmu.extract()
+    closing.join()
+    assert alive == [True]
     assert not folder.exists()
 
 
