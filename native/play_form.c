@@ -87,7 +87,7 @@ static void read_starts(Reader *reader, PlayForm *p, const Rows *rows) {
     }
 }
 
-static void read_program(Reader *reader, PlayForm *p, ProgramForm *program, const Rows *rows) {
+static void read_program(Reader *reader, ProgramForm *program, const Rows *rows) {
     const Block form = read_block(reader);
     size_t count;
     const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
@@ -122,8 +122,8 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
     p->play.before_inputs = read_copies(&reader, &p->before_inputs, &all);
     p->play.before_conclusion = read_copies(&reader, &p->before_conclusion, &all);
     read_starts(&reader, p, &all);
-    read_program(&reader, p, &p->inputs, &all);
-    read_program(&reader, p, &p->conclusion, &all);
+    read_program(&reader, &p->inputs, &all);
+    read_program(&reader, &p->conclusion, &all);
     if (reader.at != reader.end || p->inputs.program.number_of_seen > 0 ||
         p->conclusion.program.number_of_results != PROGRAM_RESULTS) {
         reader_refuse(&reader, "a program does not fit the pool");
