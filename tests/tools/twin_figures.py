@@ -84,7 +84,7 @@ def trained(goal, folder, seed):
     task = goal.task if "/" in goal.task else str(folder / goal.task)
     make_env = partial(maker_of(task), physical=True)
     with make_env() as env:
-        names = [*env.task.document.get("scenarios", {})]
+        names = [] if env.resolved is None else [*env.task.document.get("scenarios", {})]
     tests = {name: partial(make_env, scenario=name) for name in names} or {"test": make_env}
     place = folder / f"{goal.task.replace('/', '_')}_{goal.steps:g}_{seed}"
     limits = {"minutes": goal.minutes} if goal.minutes else {"steps": goal.steps}
