@@ -109,11 +109,10 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
                       const Row *rows, size_t number_of_rows) {
     const Rows all = {rows, number_of_rows};
 
-    p->form = malloc(size + 1);
+    p->form = form_copy(form, size);
     if (p->form == NULL) {
-        return "out of memory";
+        return form_no_memory;
     }
-    memcpy(p->form, form, size);
     Reader reader = {p->form, p->form + size, NULL};
     p->play.count = s->count;
     p->play.reads_kept = read_flag(&reader);

@@ -43,7 +43,7 @@ class EachHooks(VectorTask):
 
     def __init__(self, envs: Sequence[FMUEnv], pool: Pool, max_episode_steps: int | None) -> None:
         super().__init__(SeparateEpisodes(envs, pool))
-        self._envs, self._observed = envs, pool.observations
+        self._observed = pool.observations
         self._checks_all = is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = batch_space(envs[0].action_space, len(envs))
@@ -60,24 +60,24 @@ class EachHooks(VectorTask):
         """See ``VectorTask.reset``."""
         infos: dict[int, dict[str, Any]] = {}
         self.has_moved = False
-        draws_of_reset(self._envs[0], options, "reset_mask")  # it refuses unknown options
+        draws_of_reset(self.episodes.envs[0], options, "reset_mask")  # it refuses unknown options
         for index in np.flatnonzero(mask).tolist():
             seed = None if seeds is None else seeds[index]
             observation, infos[index] = self._reset(index, seed, options)
             self._observations[index] = _copied(observation)
         self.episodes.note_starts(mask)
-        return self._joined(), gathered(infos, len(self._envs))
+        return self._joined(), gathered(infos, len(self.episodes.envs))
 
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        env = self._envs[index]
+        env = self.episodes.envs[index]
         is_first = not env._was_reset
         try:
             self.has_moved = True  # what can be refused was checked before
             result = env.reset(seed=seed, options=dict(options))
             if is_first:  # a reset prepares the hooks
-                _share_constants(self._envs[0], env)
+                _share_constants(self.episodes.envs[0], env)
             return result
         except FMUGymError as error:
             raise _located(error, index) from error
@@ -89,7 +89,7 @@ class EachHooks(VectorTask):
         """See ``VectorTask.assuming``."""
         self.offsets = offsets
         try:
-            with assumed(map(future_of, self._envs), tables):
+            with assumed(map(future_of, self.episodes.envs), tables):
                 yield
         finally:
             self.offsets = None
@@ -97,7 +97,7 @@ class EachHooks(VectorTask):
     def observe(self, indices: IndexArray) -> Any:
         """See ``VectorTask.observe``."""
         for index in indices.tolist():
-            self._observations[index] = _copied(first_observation(self._envs[index])[0])
+            self._observations[index] = _copied(first_observation(self.episodes.envs[index])[0])
         return self._joined()
 
     # Steps
@@ -110,20 +110,23 @@ class EachHooks(VectorTask):
         try:
             return super().step(actions, restart=restart, resting=resting)
         except BaseException:
-            for env in self._envs:
+            for env in self.episodes.envs:
                 if self.has_moved:  # its FMU has stepped without a result
                     env._ended = True
             raise
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> None:
         """See ``VectorTask._take_actions``; if an action cannot be used, none has taken any."""
-        actions, idles = self._actions(actions), np.zeros(len(self._envs)) if idle is None else idle
+        actions, idles = (
+            self._actions(actions),
+            np.zeros(len(self.episodes.envs)) if idle is None else idle,
+        )
         running = np.flatnonzero(np.logical_not(idles)).tolist()
         befores: list[tuple[FMUEnv, Any]] = []
         given, index = self._pool.inputs.copy(), 0
         try:
             for index in running:
-                env = self._envs[index]
+                env = self.episodes.envs[index]
                 befores.append((env, take_action(env, actions[index])))
         except BaseException as error:
             for env, before in befores:
@@ -135,17 +138,17 @@ class EachHooks(VectorTask):
 
     def _actions(self, actions: Any) -> Sequence[Any]:
         """Copy the action of each environment, because hooks keep it."""
-        space = self._envs[0].action_space
+        space = self.episodes.envs[0].action_space
         if self._checks_all:
-            return cast(Sequence[Any], checked_actions(space, len(self._envs), actions))
+            return cast(Sequence[Any], checked_actions(space, len(self.episodes.envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
         except Exception:  # users' actions may raise anything
             raise ConfigError(
                 f"the actions do not make one of {space} for each environment: {shown(actions)}"
             ) from None
-        if len(items) != len(self._envs):
-            raise ConfigError(f"there are {len(items)} actions, expected {len(self._envs)}")
+        if len(items) != len(self.episodes.envs):
+            raise ConfigError(f"there are {len(items)} actions, expected {len(self.episodes.envs)}")
         return items
 
     def _add_offsets(self, idle: MaskArray | None = None) -> None:
@@ -170,7 +173,7 @@ class EachHooks(VectorTask):
         idles, infos = [False] * len(columns) if idle is None else idle.tolist(), started or {}
         index = 0
         try:
-            for index, (env, is_idle) in enumerate(zip(self._envs, idles, strict=True)):
+            for index, (env, is_idle) in enumerate(zip(self.episodes.envs, idles, strict=True)):
                 if is_idle:
                     observation = self._observations[index]
                     results.append((observation, 0.0, False, False, infos.get(index, {})))
@@ -186,7 +189,7 @@ class EachHooks(VectorTask):
     def _result(self, results: Sequence[Result], idle: MaskArray | None) -> StepResult:
         _, rewards, terminated, cut_off, infos = zip(*results, strict=True)
         truncated = np.array(cut_off, np.bool_)
-        counts = [env._episode.step_count for env in self._envs]
+        counts = [env._episode.step_count for env in self.episodes.envs]
         truncated |= np.array(counts) >= self._limit
         truncated &= True if idle is None else ~idle
         ends = np.array(terminated, np.bool_)
@@ -196,7 +199,7 @@ class EachHooks(VectorTask):
 
     def _joined(self) -> Any:
         """The observations of all in new arrays."""
-        space, count = self._envs[0].observation_space, len(self._envs)
+        space, count = self.episodes.envs[0].observation_space, len(self.episodes.envs)
         try:
             if type(self._observations[0]) is np.ndarray:
                 joined = np.array(self._observations)

@@ -203,8 +203,9 @@ class VectorTask(ABC):
     def observe(self, indices: IndexArray) -> Any:
         """Observations of all environments; the given ones may have changed."""
 
-    def rebind(self) -> None:  # noqa: B027  (most tasks have nothing to do)
+    def rebind(self) -> None:
         """Use the arrays of the episodes anew, of which some are other ones now."""
+        return
 
     @abstractmethod
     def assuming(
