@@ -37,6 +37,10 @@ _SLACK_OF_TIME: Final = 20.0
 _SURE: Final = 10
 """The steps of which the fastest one tells how slow an FMU is; the first one may load its data."""
 
+_SLOW: Final = 0.02
+"""The seconds that a slow step takes; other work on the machine delays each step by less, though
+often by the 4 ms between two decisions of a scheduler."""
+
 _LEAST: Final = 30
 """The least steps of the longest episode, unless all steps are slow."""
 
@@ -72,9 +76,9 @@ class Budget:
         self._begin = self._now if steps == 1 else self._begin
         self.fastest = min(self.fastest, self._now - before)
         is_late = self._now - self._begin > _SLACK_OF_TIME * self._seconds
-        is_slow = steps * self.fastest > self._seconds
-        least = _LEAST if not is_slow else 1 if is_late else _SURE
-        self.spent = (is_late or is_slow) and steps >= least
+        is_long = steps * self.fastest > self._seconds
+        least = _LEAST if self.fastest < _SLOW else 1 if is_late else _SURE
+        self.spent = (is_late or is_long) and steps >= least
         return self.spent
 
 
