@@ -23,8 +23,6 @@ Program = tuple[bytes, tuple[Array, ...]]
 def evaluate(
     program: Program,
     count: int,
-    results: tuple[Array, ...],
-    seen: tuple[Array, ...],
     /,
 ) -> bool:
     """Run a program on count environments outside of a step.
@@ -32,8 +30,6 @@ def evaluate(
     Args:
         program: The program.
         count: The number of environments.
-        results: Arrays for the results, shape (count,).
-        seen: Arrays for the observations, environments first.
 
     Returns:
         Whether an index was outside of its table.
@@ -205,10 +201,8 @@ class Pool:
         previous: Array,
         draws: Draws,
         states: Array,
-        step_counts: Array,
         ended: Array,
         kept: Array,
-        done: Array | None,
         results: tuple[Any, ...],
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""

@@ -47,7 +47,8 @@ static const void *loaded(const Evaluation *e, const char *from, size_t step, si
 }
 
 static char *place_in(const Evaluation *e, const Row *row) {
-    return row->data + e->begin * row->stride * row->size;
+    char *first = row->data == NULL ? e->source->arrays[row->array] + row->offset : row->data;
+    return first + e->begin * row->stride * row->size;
 }
 
 static const void *load_row(const Evaluation *e, const Row *row, Register *to) {
@@ -61,11 +62,9 @@ static const void *load_row(const Evaluation *e, const Row *row, Register *to) {
     return loaded(e, from, row->stride, row->size, to);
 }
 
-WIDE static void find_active(const int8_t *statuses, const uint8_t *ended, size_t count,
-                             uint8_t *restrict to) {
+WIDE static void find_failed(const int8_t *statuses, size_t count, uint8_t *restrict to) {
     for (size_t j = 0; j < count; j++) {
-        const bool failed = (statuses[j] > STATUS_WARNING) & (statuses[j] != STATUS_TERMINATED);
-        to[j] = !failed & !ended[j];
+        to[j] = (statuses[j] > STATUS_WARNING) & (statuses[j] != STATUS_TERMINATED);
     }
 }
 
@@ -75,24 +74,14 @@ WIDE static void find_stopped(const int8_t *statuses, size_t count, uint8_t *res
     }
 }
 
-static void load_active(const Evaluation *e, uint8_t *to) {
-    static const int8_t ok[PROGRAM_WIDTH];
-    static const uint8_t none[PROGRAM_WIDTH];
-    const Source *s = e->source;
-
-    find_active(s->statuses == NULL ? ok : s->statuses + e->begin,
-                s->ended == NULL ? none : s->ended + e->begin, e->count, to);
-    clear_rest(to, e->count, e->lanes, 1);
-}
-
-static void load_stopped(const Evaluation *e, uint8_t *to) {
+static void load_flag(const Evaluation *e, uint16_t operation, uint8_t *to) {
     memset(to, 0, e->lanes);
-    if (e->source->statuses != NULL) {
+    if (e->source->statuses != NULL && operation == LOAD_FAILED) {
+        find_failed(e->source->statuses + e->begin, e->count, to);
+    } else if (e->source->statuses != NULL) {
         find_stopped(e->source->statuses + e->begin, e->count, to);
     }
 }
-
-static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 1, 1};
 
 /* The first loop looks whether there is any such value; nearly always there is none. */
 #define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
@@ -109,29 +98,15 @@ static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 1, 1};
 NOTE_NOT_FINITE(double, note_not_finite, int64_t, fabs, DBL_MAX)
 NOTE_NOT_FINITE(float, note_not_finite32, int32_t, fabsf, FLT_MAX)
 
-void program_clear_seen(const Program *program, char *const *seen, size_t index) {
-    for (size_t i = 0; i < program->number_of_slots; i++) {
-        const Slot *slot = &program->slots[i];
-        const size_t size = size_of_type[slot->type];
-        memset(seen[slot->array] + (index * slot->elements + slot->element) * size, 0, size);
-    }
-}
-
 static void store_row(const Evaluation *e, const Row *row, const void *values) {
     copy_values(place_in(e, row), row->stride, values, 1, e->count, row->size);
-}
-
-static char *place_of(const Evaluation *e, const Slot *slot) {
-    const size_t first = e->begin * slot->elements + slot->element;
-    return e->source->seen[slot->array] + first * size_of_type[slot->type];
-}
-
-static void store_seen(const Evaluation *e, const Slot *slot, const void *from) {
-    copy_values(place_of(e, slot), slot->elements, from, 1, e->count, size_of_type[slot->type]);
-    if (slot->type == VALUE_DOUBLE) {
-        note_not_finite(from, e->count, e->notes);
-    } else if (slot->type == VALUE_FLOAT) {
-        note_not_finite32(from, e->count, e->notes);
+    if (row->data != NULL) {
+        return;
+    }
+    if (row->type == VALUE_DOUBLE) {
+        note_not_finite(values, e->count, e->notes);
+    } else if (row->type == VALUE_FLOAT) {
+        note_not_finite32(values, e->count, e->notes);
     }
 }
 
@@ -152,11 +127,11 @@ WIDE static void convert_lines(const double *restrict values, size_t step, size_
 }
 
 /* Stores outputs of which each environment's follow each other. All of them are finite as floats. */
-static void store_fresh(const Evaluation *e, const Slot *slot, size_t output, size_t number) {
+static void store_fresh(const Evaluation *e, const Row *to, size_t output, size_t number) {
     const Fresh *fresh = e->source->fresh;
 
     convert_lines(fresh->lines + output, fresh->width, e->count, number,
-                  (float *)(void *)place_of(e, slot), slot->elements);
+                  (float *)(void *)place_in(e, to), to->stride);
 }
 
 /* Whether rows are those of outputs that follow each other. */
@@ -170,17 +145,17 @@ static bool are_neighbours(const Row *rows, size_t number) {
 }
 
 /* Stores rows of doubles as floats in neighbouring elements. */
-static void store_floats(const Evaluation *e, const Row *rows, const Slot *slots, size_t number) {
+static void store_floats(const Evaluation *e, const Row *from, const Row *to, size_t number) {
     const Fresh *fresh = e->source->fresh;
     Register doubles, floats;
 
-    if (fresh != NULL && fresh->fits_floats && are_neighbours(rows, number)) {
-        store_fresh(e, slots, rows->output - 1, number);
+    if (fresh != NULL && fresh->fits_floats && are_neighbours(from, number)) {
+        store_fresh(e, to, from->output - 1, number);
         return;
     }
     for (size_t k = 0; k < number; k++) {
-        convert(load_row(e, &rows[k], &doubles), e->count, floats.floats);
-        store_seen(e, &slots[k], &floats);
+        convert(load_row(e, &from[k], &doubles), e->count, floats.floats);
+        store_row(e, &to[k], &floats);
     }
 }
 
@@ -193,21 +168,15 @@ void operation_move(const Evaluation *e, Instruction i) {
     case LOAD_ROW:
         *place = load_row(e, &program->rows[i.extra], to);
         break;
-    case LOAD_ACTIVE:
-        *place = to;
-        load_active(e, to->flags);
-        break;
+    case LOAD_FAILED:
     case LOAD_STOPPED:
         *place = to;
-        load_stopped(e, to->flags);
+        load_flag(e, i.operation, to->flags);
         break;
     case STORE_ROW:
         store_row(e, &program->rows[i.extra], e->registers->places[i.a]);
         break;
-    case STORE_SEEN:
-        store_seen(e, &program->slots[i.extra], e->registers->places[i.a]);
-        break;
     default:
-        store_floats(e, &program->rows[i.a], &program->slots[i.extra], i.b);
+        store_floats(e, &program->rows[i.a], &program->rows[i.extra], i.b);
     }
 }

@@ -2,13 +2,9 @@
 
 #include "play.h"
 
-#include <float.h>
-#include <math.h>
 #include <string.h>
 
 #include "platform.h"
-
-enum { DONE, TRUNCATED, REWARD };
 
 WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t lowest,
                                 int64_t highest) {
@@ -69,14 +65,14 @@ void play_draw(const Turn *turn, size_t index) {
 static Source source_of(const Turn *turn) {
     Source source = turn->play->source;
 
-    source.ended = turn->play->ended;
-    source.seen = turn->seen;
+    source.arrays = turn->arrays;
     return source;
 }
 
 void play_open(const Turn *turn, PlayScratch *scratch) {
     program_prepare(&turn->play->inputs, scratch->memory, &scratch->inputs);
     program_prepare(&turn->play->conclusion, scratch->memory, &scratch->conclusion);
+    program_prepare(&turn->play->observation, scratch->memory, &scratch->observation);
 }
 
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
@@ -91,15 +87,6 @@ void play_keep_outputs(const Play *play, size_t first, size_t number, size_t beg
     for (size_t i = first; i < first + number; i++) {
         const size_t place = i * play->count + begin;
         memcpy(play->kept_rows + place, play->output_rows + place, count * sizeof(double));
-    }
-}
-
-WIDE static void count_steps(const Play *play, size_t begin, size_t count) {
-    const uint8_t *restrict ended = play->ended + begin;
-    int64_t *restrict step_counts = play->step_counts + begin;
-
-    for (size_t j = 0; j < count; j++) {
-        step_counts[j] = ended[j] ? 0 : step_counts[j] + 1;
     }
 }
 
@@ -121,7 +108,6 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     if (play->reads_kept) {
         play_keep_outputs(play, 0, play->number_of_outputs, begin, count);
     }
-    count_steps(play, begin, count);
 }
 
 /* An episode that starts has no action yet. */
@@ -211,39 +197,11 @@ void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
     start_listed(turn, starting, number);
 }
 
-/* Avoids branches, because the processor could not predict them. Handles the wide values first,
- * then the bytes. */
-WIDE static size_t end_episodes(const Turn *turn, size_t begin, size_t count,
-                                const uint8_t *dones, const uint8_t *cuts,
-                                const double *rewards, size_t *troubled) {
-    const Play *play = turn->play;
-    const int64_t *step_counts = play->step_counts + begin;
-    const int64_t limit = play->limit;
-    uint8_t *restrict ended = play->ended + begin;
-    uint8_t *restrict terminated = turn->terminated + begin;
-    uint8_t *restrict truncated = turn->truncated + begin;
-    double *restrict given = turn->rewards + begin;
-    uint8_t cut[PROGRAM_WIDTH], number = 0;
-    int64_t bad = 0; /* as wide as the rewards, so that the compiler can vectorize */
+WIDE static size_t number_of(const uint8_t *flags, size_t count) {
+    uint8_t number = 0;
 
     for (size_t j = 0; j < count; j++) {
-        cut[j] = cuts[j] | (step_counts[j] >= limit);
-    }
-    for (size_t j = 0; j < count; j++) {
-        given[j] = ended[j] ? 0.0 : rewards[j];
-    }
-    for (size_t j = 0; j < count; j++) {
-        bad += !(fabs(given[j]) <= DBL_MAX);
-    }
-    *troubled += (size_t)bad;
-    for (size_t j = 0; j < count; j++) {
-        terminated[j] = dones[j] & !ended[j];
-        truncated[j] = cut[j] & !ended[j];
-        ended[j] = terminated[j] | truncated[j];
-        number += ended[j];
-    }
-    if (play->done != NULL) {
-        memcpy(play->done + begin, terminated, count);
+        number += flags[j];
     }
     return number;
 }
@@ -261,8 +219,6 @@ void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fr
                 PlayScratch *scratch, Verdict *verdict) {
     const Play *play = turn->play;
     Source source = source_of(turn);
-    const uint16_t *results = play->conclusion.results;
-    const void *const *places = scratch->conclusion.places;
     Notes notes = {.outside = false};
 
     source.fresh = fresh;
@@ -270,35 +226,26 @@ void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fr
     program_run(&play->conclusion, &source, begin, count, &scratch->conclusion, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
     add_notes(&notes, count, verdict);
-    verdict->ended +=
-        end_episodes(turn, begin, count, places[results[DONE]], places[results[TRUNCATED]],
-                     places[results[REWARD]], &verdict->troubled);
+    verdict->ended += number_of(play->ended + begin, count);
 }
 
-/* Marks the environments as ended while the program runs: there it leaves the episode variables as
- * they were. */
 void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
                   Verdict *verdict) {
     const Play *play = turn->play;
     const Source source = source_of(turn);
-    uint8_t *ended = play->ended + begin, before[PROGRAM_WIDTH];
     Notes notes = {.outside = false};
 
     copy_rows(&play->before_conclusion, begin, count);
-    memcpy(before, ended, count);
-    memset(ended, 1, count);
-    program_run(&play->conclusion, &source, begin, count, &scratch->conclusion, &notes);
-    memcpy(ended, before, count);
+    program_run(&play->observation, &source, begin, count, &scratch->observation, &notes);
     add_notes(&notes, count, verdict);
 }
 
 void play_skip(const Turn *turn, size_t index) {
-    turn->rewards[index] = 0.0;
-    turn->terminated[index] = turn->truncated[index] = 0;
-    if (turn->play->done != NULL) {
-        turn->play->done[index] = 0;
+    const Play *play = turn->play;
+
+    for (size_t i = 0; i < play->number_of_arrays; i++) {
+        memset(turn->arrays[i] + index * play->array_sizes[i], 0, play->array_sizes[i]);
     }
-    program_clear_seen(&turn->play->conclusion, turn->seen, index);
     if (turn->started != NULL) {
         turn->started[index] = 0;
     }

@@ -54,8 +54,12 @@ typedef struct {
 typedef struct {
     size_t count;
     Program inputs;    /* stores the inputs */
-    Program conclusion; /* stores the rest; its results are done, truncated, reward */
+    Program conclusion; /* stores the rest: episode variables, results, which episodes have ended */
+    Program observation; /* stores the observations and infos of episodes that start */
     Source source;     /* only the statuses; each step sets the rest */
+    size_t number_of_arrays; /* that each call brings: */
+    size_t number_of_seen;   /* those of observations and infos are the first ones */
+    size_t array_sizes[MOST_ARRAYS]; /* bytes of one environment in each of them */
     Actions actions;
     const double *output_rows;
     double *kept_rows; /* the outputs before the step */
@@ -69,23 +73,16 @@ typedef struct {
     size_t number_of_parameters;
     const Draws *draws;
     Stream *streams; /* the random stream of each environment */
-    int64_t *step_counts;
-    int64_t limit;  /* steps after which an episode is truncated */
     uint8_t *ended; /* which environments start an episode instead of taking a step */
-    uint8_t *done;  /* where the latest step has ended the task, not only the episode; or NULL */
 } Play;
 
 /* One step of all environments, and where its results go. */
 typedef struct Turn {
     const Play *play;
     const char *actions;
-    double *rewards;
-    uint8_t *terminated, *truncated;
-    char *const *seen; /* the arrays of the observations and infos that the conclusion stores */
-    float *last_observations; /* those of episodes that end, where the next ones start at once */
-    char *const *last_seen;   /* the same for the arrays that the conclusion stores */
-    const size_t *seen_sizes; /* bytes of one environment in each of these arrays */
-    uint8_t *started;         /* where they have started; NULL if they start in the next step */
+    char *const *arrays;
+    char *const *last; /* observations and infos of episodes that end, where others start at once */
+    uint8_t *started;  /* where they have started; NULL if they start in the next step */
     double *drawn; /* a row for each draw; only the values drawn in this step are written */
 } Turn;
 
@@ -95,14 +92,14 @@ bool play_has_bad_action(const Turn *turn);
 /* Scratch memory of one thread. */
 typedef struct {
     Register memory[PROGRAM_REGISTERS]; /* of one program at a time */
-    Registers inputs, conclusion;
+    Registers inputs, conclusion, observation;
 } PlayScratch;
 
 /* What became of a run. */
 typedef struct {
     size_t ended;    /* episodes that have just ended */
     size_t troubled; /* environments with numbers that are not finite */
-    uint8_t not_finite[PROGRAM_WIDTH]; /* which of the latest run have stored such numbers */
+    uint8_t not_finite[PROGRAM_WIDTH]; /* which of the latest run have such results */
     bool outside;    /* whether a hook looked up an index outside of a table */
 } Verdict;
 
@@ -126,7 +123,7 @@ void play_keep_outputs(const Play *play, size_t first, size_t number, size_t beg
 /* Sets what programs and hooks read at the start of an episode: actions, and the rows of starts. */
 void play_start_episode(const Turn *turn, size_t index);
 
-/* Writes the results of an environment that is neither reset nor stepped, because memory ran
+/* Writes zeros as the results of an environment that is neither reset nor stepped, because memory ran
  * out. */
 void play_skip(const Turn *turn, size_t index);
 

@@ -5,9 +5,14 @@
 #include <stdlib.h>
 #include <string.h>
 
+/* The rows that a form names by numbers: those of memory that stays, and, by -1 and less, those in
+ * arrays of a call. */
 typedef struct {
     const Row *rows;
     size_t count;
+    const int64_t *stored; /* for each: array, element, elements of one environment, type */
+    size_t number_of_stored;
+    size_t number_of_arrays; /* in which a program may store */
 } Rows;
 
 static Row row_of(Reader *reader, const Rows *rows, int64_t number) {
@@ -87,14 +92,51 @@ static void read_starts(Reader *reader, PlayForm *p, const Rows *rows) {
     }
 }
 
-static void read_program(Reader *reader, ProgramForm *program, const Rows *rows) {
+enum { LARGEST = 1 << 24 /* elements of one environment in an array */ };
+
+/* A row in an array of a call; notes how large this must be. */
+static Row stored_row(Reader *reader, PlayForm *p, size_t arrays, const int64_t *numbers) {
+    static const size_t sizes[VALUE_TYPES] = {8, 4, 8, 1, 1};
+    const uint64_t array = (uint64_t)numbers[0], element = (uint64_t)numbers[1],
+                   elements = (uint64_t)numbers[2], type = (uint64_t)numbers[3];
+
+    if (array >= arrays || elements > LARGEST || element >= elements || type >= VALUE_TYPES) {
+        reader_refuse(reader, "there is no such element of an array");
+        return (Row){.data = NULL};
+    }
+    const size_t size = sizes[type];
+    if (p->stored_sizes[array] != 0 && p->stored_sizes[array] != elements * size) {
+        reader_refuse(reader, "elements of an array differ in type");
+    }
+    p->stored_sizes[array] = elements * size;
+    return (Row){.array = array,
+                 .offset = element * size,
+                 .size = size,
+                 .stride = elements,
+                 .type = (uint32_t)type};
+}
+
+static Row row_of_program(Reader *reader, PlayForm *p, const Rows *rows, int64_t number) {
+    const uint64_t place = (uint64_t)(-1 - number);
+
+    if (number >= 0) {
+        return row_of(reader, rows, number);
+    }
+    if (place >= rows->number_of_stored) {
+        reader_refuse(reader, "there is no such row");
+        return (Row){.data = NULL};
+    }
+    return stored_row(reader, p, rows->number_of_arrays, rows->stored + 4 * place);
+}
+
+static void read_program(Reader *reader, PlayForm *p, ProgramForm *program, const Rows *rows) {
     const Block form = read_block(reader);
     size_t count;
     const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
     Row *own = reader_room(reader, count, sizeof *own);
 
     for (size_t i = 0; i < count && reader->fault == NULL; i++) {
-        own[i] = row_of(reader, rows, numbers[i]);
+        own[i] = row_of_program(reader, p, rows, numbers[i]);
     }
     const char *fault = reader->fault;
     fault = fault == NULL ? program_take(program, form.bytes, form.size, count) : fault;
@@ -107,7 +149,7 @@ static void read_program(Reader *reader, ProgramForm *program, const Rows *rows)
 
 const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t size,
                       const Row *rows, size_t number_of_rows) {
-    const Rows all = {rows, number_of_rows};
+    Rows all = {.rows = rows, .count = number_of_rows};
 
     p->form = form_copy(form, size);
     if (p->form == NULL) {
@@ -116,17 +158,18 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
     Reader reader = {p->form, p->form + size, NULL};
     p->play.count = s->count;
     p->play.reads_kept = read_flag(&reader);
-    p->play.limit = read_integer(&reader);
+    p->play.number_of_seen = (size_t)read_integer_in(&reader, 0, MOST_ARRAYS);
     read_actions(&reader, p);
     p->play.before_inputs = read_copies(&reader, &p->before_inputs, &all);
     p->play.before_conclusion = read_copies(&reader, &p->before_conclusion, &all);
     read_starts(&reader, p, &all);
-    read_program(&reader, &p->inputs, &all);
-    read_program(&reader, &p->conclusion, &all);
-    if (reader.at != reader.end || p->inputs.program.number_of_seen > 0 ||
-        p->conclusion.program.number_of_results != PROGRAM_RESULTS) {
-        reader_refuse(&reader, "a program does not fit the pool");
-    }
+    read_program(&reader, p, &p->inputs, &all); /* it runs without arrays of a call */
+    all.stored = read_array(&reader, 4 * sizeof *all.stored, &all.number_of_stored);
+    all.number_of_arrays = MOST_ARRAYS;
+    read_program(&reader, p, &p->conclusion, &all);
+    all.number_of_arrays = p->play.number_of_seen;
+    read_program(&reader, p, &p->observation, &all);
+    reader_require(&reader, reader.at == reader.end, form_truncated);
     return reader.fault;
 }
 
@@ -142,24 +185,24 @@ static void note_outputs(ProgramForm *p, const Settings *s) {
     }
 }
 
-void play_settle(PlayForm *p, const Settings *s, double *kept, int64_t *step_counts,
-                 uint8_t *ended) {
+void play_settle(PlayForm *p, const Settings *s, double *kept, uint8_t *ended) {
     Play *play = &p->play;
 
     note_outputs(&p->conclusion, s);
     play->inputs = p->inputs.program;
     play->conclusion = p->conclusion.program;
+    play->observation = p->observation.program;
     play->source.statuses = s->status;
     play->output_rows = s->output_values;
     play->number_of_outputs = s->outputs->count;
     play->kept_rows = kept;
-    play->step_counts = step_counts;
     play->ended = ended;
 }
 
 void play_drop(PlayForm *p) {
     program_drop(&p->inputs);
     program_drop(&p->conclusion);
+    program_drop(&p->observation);
     free(p->before_inputs);
     free(p->before_conclusion);
     free(p->starts);

@@ -10,10 +10,11 @@
 /* A play, and the memory that belongs to it. */
 typedef struct {
     Play play;
-    ProgramForm inputs, conclusion;
+    ProgramForm inputs, conclusion, observation;
     char *form;         /* a copy of it, which the play points to */
     RowCopy *before_inputs, *before_conclusion;
     RowStart *starts;
+    size_t stored_sizes[MOST_ARRAYS]; /* bytes of one environment, where programs store in an array */
 } PlayForm;
 
 /* Reads the form of a play, which names rows by their numbers among these. The caller has set the
@@ -22,9 +23,8 @@ typedef struct {
 const char *play_take(PlayForm *p, const Settings *settings, const void *form, size_t size,
                       const Row *rows, size_t number_of_rows);
 /* Lets a play use the outputs and statuses of a pool, and memory of its owner: the outputs before a
- * step, the steps of each episode, and which of them have ended. */
-void play_settle(PlayForm *p, const Settings *settings, double *kept, int64_t *step_counts,
-                 uint8_t *ended);
+ * step, and which episodes have ended. */
+void play_settle(PlayForm *p, const Settings *settings, double *kept, uint8_t *ended);
 void play_drop(PlayForm *p);
 
 #endif

@@ -10,10 +10,7 @@
 
 #include "lanes.h"
 
-enum {
-    PROGRAM_REGISTERS = 256, /* maximum number of registers */
-    PROGRAM_RESULTS = 3      /* maximum number of results */
-};
+enum { PROGRAM_REGISTERS = 256 /* maximum number of registers */ };
 
 /* OPERATIONS in fmugym/expressions/program.py lists their names in the same order. Importing
  * that module compares the two. The letters are those of numpy's types: d float64, f float32,
@@ -35,10 +32,9 @@ enum {
 
 #define EACH_OPERATION(X)                                                                          \
     X(LOAD_ROW, "load_row")                                                                        \
-    X(LOAD_ACTIVE, "load_active")                                                                  \
+    X(LOAD_FAILED, "load_failed")                                                                  \
     X(LOAD_STOPPED, "load_stopped")                                                                \
     X(STORE_ROW, "store_row")                                                                      \
-    X(STORE_SEEN, "store_seen")                                                                    \
     X(STORE_FLOATS, "store_floats")                                                                \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
@@ -107,11 +103,11 @@ extern const char *const operation_names[NUMBER_OF_OPERATIONS];
  * bytes of actions that are switches. A cast's extra is from * VALUE_TYPES + to. */
 enum { VALUE_DOUBLE, VALUE_FLOAT, VALUE_INTEGER, VALUE_FLAG, VALUE_BYTE, VALUE_TYPES };
 
-enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
+enum { MOST_ARRAYS = 67 /* maximum number of arrays that a call brings for programs to store in */ };
 
-/* to, a, b and c are registers. extra is the number of a row, of a slot, a table or a pair of types,
- * as the operation needs it. In STORE_FLOATS, extra is the first
- * slot, a the first row, and b how many there are. */
+/* to, a, b and c are registers. extra is the number of a row, a table or a pair of types, as the
+ * operation needs it. In STORE_FLOATS, a is the first row to load, extra the first one to store in, and
+ * b how many there are. */
 typedef struct {
     uint16_t operation, extra, to, a, b, c;
 } Instruction;
@@ -132,20 +128,18 @@ typedef struct {
     uint32_t unused;
 } Constant;
 
-/* One value for each instance. */
+/* One value for each instance, in memory that stays, or in an array that each call brings. Programs
+ * only store in the latter. */
 typedef struct {
-    char *data;
+    char *data;    /* NULL if it is in an array of the call */
+    size_t array;  /* the number of that array */
+    size_t offset; /* bytes from there to the value of the first instance */
     size_t size;   /* bytes of a value */
     size_t stride; /* values from one instance to the next: 1 unless it is an element of an array */
+    uint32_t type; /* in an array of the call: VALUE_DOUBLE and so on */
     bool changes; /* whether the program stores in it */
     uint32_t output; /* 1 more than the number of the output whose values these are, or 0 */
 } Row;
-
-/* An element of an array that has the instances on its first axis. */
-typedef struct {
-    uint32_t array, element, elements; /* elements: of one instance */
-    uint32_t type;
-} Slot;
 
 /* Values to look up. For an interpolation: n coordinates that never fall, n values, and the values to
  * the left and to the right of them. */
@@ -160,11 +154,8 @@ typedef struct {
     const Constant *constants;
     const Register *filled; /* the constants, in all places of their registers */
     const Row *rows;
-    const Slot *slots;
     const Table *tables;
-    size_t length, number_of_constants, number_of_rows, number_of_slots, number_of_tables,
-        number_of_seen, registers, number_of_results;
-    uint16_t results[PROGRAM_RESULTS];
+    size_t length, number_of_constants, number_of_rows, number_of_tables, registers;
 } Program;
 
 /* The outputs of a run, which are also in their rows. */
@@ -176,15 +167,14 @@ typedef struct {
 
 /* What changes from call to call. */
 typedef struct {
-    const uint8_t *ended;   /* NULL stands for none */
     const int8_t *statuses; /* NULL stands for all OK */
-    char *const *seen;      /* the arrays that the slots refer to */
+    char *const *arrays;    /* those of the call */
     const Fresh *fresh;     /* NULL if the outputs are in their rows only */
 } Source;
 
 /* What a run notes. */
 typedef struct {
-    uint8_t not_finite[PROGRAM_WIDTH]; /* which instances have stored such a value */
+    uint8_t not_finite[PROGRAM_WIDTH]; /* which instances have stored such a value in an array */
     bool outside;                      /* whether an index was outside of its table */
 } Notes;
 
@@ -204,9 +194,6 @@ void program_prepare(const Program *program, Register *memory, Registers *regist
 /* Whether every operand refers to something that exists. The program writes and reads count
  * instances of rows that are long enough. */
 bool program_is_sound(const Program *program);
-
-/* Sets what the program would store in the arrays of one instance to 0. */
-void program_clear_seen(const Program *program, char *const *seen, size_t index);
 
 /* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Arithmetic is done
  * for whole blocks, because compilers turn such loops into vector instructions without a remainder;

@@ -15,8 +15,6 @@ bool read_draws(Reader *reader, Draws *draws) {
                    "the numbers do not fit the kinds of distributions");
 }
 
-enum { LARGEST_SEEN = 1 << 24 }; /* elements of an observation */
-
 static const char UNSOUND[] = "its parts do not fit together";
 
 static void read_tables(Reader *reader, ProgramForm *p) {
@@ -31,34 +29,6 @@ static void read_tables(Reader *reader, ProgramForm *p) {
     p->program.tables = p->tables;
 }
 
-/* Reads how large the arrays of observations must be. */
-static void measure_seen(Reader *reader, ProgramForm *p) {
-    static const size_t sizes[VALUE_TYPES] = {8, 4, 8, 1, 1};
-
-    for (size_t i = 0; i < p->program.number_of_slots && reader->fault == NULL; i++) {
-        const Slot *slot = &p->program.slots[i];
-        if (!reader_require(reader, slot->array < MOST_SEEN && slot->type < VALUE_TYPES &&
-                                 slot->elements <= LARGEST_SEEN,
-                     UNSOUND)) {
-            return;
-        }
-        const size_t size = slot->elements * sizes[slot->type];
-        size_t *known = &p->seen_sizes[slot->array];
-        reader_require(reader, *known == 0 || *known == size, UNSOUND);
-        *known = size;
-    }
-}
-
-static void read_results(Reader *reader, Program *program) {
-    const int64_t *results = read_array(reader, sizeof *results, &program->number_of_results);
-
-    reader_require(reader, program->number_of_results <= PROGRAM_RESULTS, UNSOUND);
-    for (size_t i = 0; i < program->number_of_results && reader->fault == NULL; i++) {
-        reader_require(reader, results[i] >= 0 && results[i] < PROGRAM_REGISTERS, UNSOUND);
-        program->results[i] = (uint16_t)results[i];
-    }
-}
-
 const char *program_take(ProgramForm *p, const void *form, size_t size, size_t number_of_rows) {
     Program *program = &p->program;
 
@@ -69,15 +39,11 @@ const char *program_take(ProgramForm *p, const void *form, size_t size, size_t n
     }
     Reader reader = {p->form, p->form + size, NULL};
     program->registers = (size_t)read_integer_in(&reader, 0, PROGRAM_REGISTERS);
-    program->number_of_seen = (size_t)read_integer_in(&reader, 0, MOST_SEEN);
     program->code = read_array(&reader, sizeof(Instruction), &program->length);
     program->constants = read_array(&reader, sizeof(Constant), &program->number_of_constants);
-    program->slots = read_array(&reader, sizeof(Slot), &program->number_of_slots);
     program->rows = p->rows = reader_room(&reader, number_of_rows, sizeof *p->rows);
     program->number_of_rows = number_of_rows;
-    read_results(&reader, program);
     read_tables(&reader, p);
-    measure_seen(&reader, p);
     reader_require(&reader, reader.at == reader.end, form_truncated);
     return reader.fault;
 }
@@ -100,8 +66,9 @@ static bool fill_constants(ProgramForm *p) {
 static void note_changes(ProgramForm *p) {
     for (size_t i = 0; i < p->program.length; i++) {
         const Instruction *code = &p->program.code[i];
-        for (size_t k = 0; code->operation == STORE_ROW && k < p->program.number_of_rows; k++) {
-            p->rows[k].changes |= p->rows[k].data == p->rows[code->extra].data;
+        const char *stored = code->operation == STORE_ROW ? p->rows[code->extra].data : NULL;
+        for (size_t k = 0; stored != NULL && k < p->program.number_of_rows; k++) {
+            p->rows[k].changes |= p->rows[k].data == stored;
         }
     }
 }

@@ -17,7 +17,6 @@ typedef struct {
     Row *rows;
     Table *tables;
     char *filled; /* the memory of the constants' registers */
-    size_t seen_sizes[MOST_SEEN]; /* of each array of observations, for one instance */
 } ProgramForm;
 
 /* Reads the form of a program that so many rows come with. Returns what is wrong with it, or NULL. The

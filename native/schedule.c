@@ -34,11 +34,11 @@ size_t task_give_up(Task *task, size_t begin, size_t end) {
         const size_t index = task->listed ? task->pool->chosen[i] : i;
         instance_refuse(&task->pool->instances[index], "out of memory");
         task->pool->settings.status[index] = STATUS_ERROR;
-        if (call->observations != NULL) {
-            write_observation(task->pool, index, call->observations);
-        }
         if (task->operation == PLAY || task->operation == AFTER) {
             play_skip(call->turn, index);
+        }
+        if (call->observations != NULL) {
+            write_observation(task->pool, index, call->observations);
         }
     }
     return end - begin;

@@ -5,7 +5,7 @@
 static size_t number_of_operands(Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
-    case LOAD_ACTIVE:
+    case LOAD_FAILED:
     case LOAD_STOPPED:
     case STORE_FLOATS:
         return 0;
@@ -14,7 +14,6 @@ static size_t number_of_operands(Instruction i) {
     case WHERE_1:
         return 3;
     case STORE_ROW:
-    case STORE_SEEN:
     case CAST:
     case TAKE:
     case INTERPOLATE:
@@ -36,17 +35,29 @@ static size_t number_of_operands(Instruction i) {
     }
 }
 
-static bool store_is_sound(const Program *program, Instruction i) {
-    const size_t slots = i.extra + (size_t)i.b, rows = i.a + (size_t)i.b;
+static bool can_be_loaded(const Row *row) {
+    return row->data != NULL;
+}
 
-    if (i.b == 0 || slots > program->number_of_slots || rows > program->number_of_rows) {
+/* Whether a row is a number of elements after another one in the same array of floats. */
+static bool is_float_after(const Row *row, const Row *first, size_t number) {
+    const uintptr_t begin = (uintptr_t)first->data + first->offset;
+
+    return (row->data == NULL) == (first->data == NULL) && row->array == first->array &&
+           (uintptr_t)row->data + row->offset == begin + number * sizeof(float) &&
+           row->stride == first->stride && row->size == sizeof(float);
+}
+
+static bool store_is_sound(const Program *program, Instruction i) {
+    const size_t number = program->number_of_rows;
+
+    if (i.b == 0 || i.extra + (size_t)i.b > number || i.a + (size_t)i.b > number) {
         return false;
     }
     for (size_t k = 0; k < i.b; k++) {
-        const Slot *first = &program->slots[i.extra], *slot = first + k;
-        if (slot->array != first->array || slot->element != first->element + k ||
-            slot->elements != first->elements || slot->type != VALUE_FLOAT ||
-            program->rows[i.a + k].size != sizeof(double)) {
+        const Row *from = &program->rows[i.a + k], *to = &program->rows[i.extra];
+        if (!is_float_after(to + k, to, k) || from->size != sizeof(double) ||
+            !can_be_loaded(from)) {
             return false;
         }
     }
@@ -56,10 +67,9 @@ static bool store_is_sound(const Program *program, Instruction i) {
 static bool extra_is_sound(const Program *program, Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
+        return i.extra < program->number_of_rows && can_be_loaded(&program->rows[i.extra]);
     case STORE_ROW:
         return i.extra < program->number_of_rows;
-    case STORE_SEEN:
-        return i.extra < program->number_of_slots;
     case STORE_FLOATS:
         return store_is_sound(program, i);
     case CAST:
@@ -80,8 +90,7 @@ static bool instruction_is_sound(const Program *program, Instruction i) {
         return false;
     }
     const uint16_t operands[] = {i.a, i.b, i.c};
-    const bool stores = i.operation == STORE_ROW || i.operation == STORE_SEEN ||
-                        i.operation == STORE_FLOATS;
+    const bool stores = i.operation == STORE_ROW || i.operation == STORE_FLOATS;
     if (!stores && i.to < program->number_of_constants) {
         return false;
     }
@@ -99,19 +108,8 @@ static bool instruction_is_sound(const Program *program, Instruction i) {
     return true;
 }
 
-static bool slots_are_sound(const Program *program) {
-    for (size_t i = 0; i < program->number_of_slots; i++) {
-        const Slot *slot = &program->slots[i];
-        if (slot->array >= program->number_of_seen || slot->element >= slot->elements ||
-            slot->type >= VALUE_TYPES) {
-            return false;
-        }
-    }
-    return true;
-}
-
 bool program_is_sound(const Program *program) {
-    if (program->registers > PROGRAM_REGISTERS || !slots_are_sound(program)) {
+    if (program->registers > PROGRAM_REGISTERS) {
         return false;
     }
     for (size_t i = 0; i < program->length; i++) {
@@ -122,11 +120,6 @@ bool program_is_sound(const Program *program) {
     for (size_t i = 0; i < program->number_of_constants; i++) {
         if (i >= program->registers || program->constants[i].to != i ||
             program->constants[i].size > 8) {
-            return false;
-        }
-    }
-    for (size_t i = 0; i < program->number_of_results; i++) {
-        if (program->results[i] >= program->registers) {
             return false;
         }
     }

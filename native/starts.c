@@ -32,7 +32,6 @@ size_t starts_one(Task *task, size_t index, Scratch scratch) {
     const size_t troubled = note_status(task, index, status);
 
     play_start_episode(call->turn, index);
-    play->step_counts[index] = 0;
     play->ended[index] = 0;
     if (call->observations == NULL) {
         return troubled;
@@ -46,27 +45,21 @@ static bool has_ended_well(const Task *task, const PlayedRun *run, size_t index)
     const Turn *turn = task->call->turn;
 
     return turn->play->ended[index] && task->pool->settings.status[index] <= STATUS_WARNING &&
-           isfinite(turn->rewards[index]) && !run->verdict->not_finite[index - run->begin] &&
+           !run->verdict->not_finite[index - run->begin] &&
            (task->call->observations == NULL || has_finite_observation(task, index));
 }
 
 static void keep_last(const Task *task, size_t index) {
     const Turn *turn = task->call->turn;
-    const size_t width = task->pool->settings.num_observed;
 
-    if (task->call->observations != NULL) {
-        memcpy(turn->last_observations + index * width, observation_of(task, index),
-               width * sizeof(float));
-    }
-    for (size_t i = 0; i < turn->play->conclusion.number_of_seen; i++) {
-        const size_t size = turn->seen_sizes[i], place = index * size;
-        memcpy(turn->last_seen[i] + place, turn->seen[i] + place, size);
+    for (size_t i = 0; i < turn->play->number_of_seen; i++) {
+        const size_t size = turn->play->array_sizes[i], place = index * size;
+        memcpy(turn->last[i] + place, turn->arrays[i] + place, size);
     }
 }
 
 size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started) {
     const Turn *turn = task->call->turn;
-    const bool observes = turn->play->conclusion.number_of_seen > 0;
     size_t troubled = 0;
 
     for (size_t index = run.begin; index < run.begin + run.count; index++) {
@@ -75,9 +68,7 @@ size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *sta
             keep_last(task, index);
             troubled += starts_one(task, index, scratch);
             ++*started;
-            if (observes) {
-                play_observe(turn, index, 1, run.registers, run.verdict);
-            }
+            play_observe(turn, index, 1, run.registers, run.verdict);
         }
     }
     return troubled;

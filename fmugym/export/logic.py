@@ -199,7 +199,8 @@ class _Sample:
         self.graph = Graph()
         self.features: tuple[int, ...] = ()
         self._env, self._formulas, self._decision = env, formulas, decision
-        variables = written_variables(env, self.graph, formulas.updates)
+        has_stepped = Value(self.graph, self.graph.load("active", None, np.dtype(np.bool_)))
+        variables = written_variables(env, self.graph, formulas.updates, has_stepped)
         observed = Translation(env, self.graph, True, variables).observation(formulas)
         self.observation = _nodes(observed)
         action, memory = self._decided(observed)

@@ -13,7 +13,6 @@ from fmugym.expressions.program import (
     CONSTANT,
     MOST_REGISTERS,
     OPERATIONS,
-    SLOT,
     TYPES,
     Program,
     Row,
@@ -30,29 +29,24 @@ _PARTNERS: Final = {"sin d": "cos d", "cos d": "sin d"}
 
 
 class Store(NamedTuple):
-    """A value to store: in a row, or as the element of an array of observations.
+    """A value to store in a row.
 
     Attributes:
         node: Its number.
-        row: The row; None for an element.
-        slot: The number of the array, the element, and the number of elements of an environment.
+        row: The row. One of the kind ``"seen"`` is an element of observations or infos, whose
+            neighbours are those of the next numbers.
     """
 
     node: int
-    row: Row | None
-    slot: tuple[int, int, int] = (0, 0, 0)
+    row: Row
 
 
-def compile_graph(
-    graph: Graph, stores: Sequence[Store], results: Sequence[int], seen: int
-) -> Program:
+def compile_graph(graph: Graph, stores: Sequence[Store]) -> Program:
     """Number the operations in the order of evaluation, and place their values in registers.
 
     Args:
         graph: The operations.
         stores: Values to store, in this order.
-        results: The nodes of the results.
-        seen: The number of arrays of observations.
 
     Raises:
         UncompilableError: If there are too many operations, or the pool does not have one of them.
@@ -65,9 +59,7 @@ def compile_graph(
             compiler.store(store)
         else:
             compiler.store_output(store, row)
-    for node in results:
-        compiler.evaluate(node)
-    return compiler.program(results, seen)
+    return compiler.program()
 
 
 class _Step(NamedTuple):
@@ -88,7 +80,6 @@ class _Compiler:
         self._constants: list[int] = []
         self._rows: dict[Row, int] = {}
         self._tables: dict[Hashable, int] = {}
-        self._slots: list[tuple[int, int, int, int]] = []
 
     def evaluate(self, node: int) -> None:
         """Add the instructions that a value needs."""
@@ -112,7 +103,7 @@ class _Compiler:
     def _output_row(self, store: Store) -> int | None:
         """The row of the FMU's output that it stores as a float32, as most observations do."""
         node = self._graph.nodes[store.node]
-        if store.row is not None or node.kind != "cast" or node.dtype != np.float32:
+        if store.row[0] != "seen" or node.kind != "cast" or node.dtype != np.float32:
             return None
         source = self._graph.nodes[node.operands[0]]
         what: Any = source.what
@@ -121,29 +112,22 @@ class _Compiler:
 
     def store_output(self, store: Store, row: int) -> None:
         """Store an output in the same instruction as the one before, if they are neighbours."""
-        slot = len(self._slots)
-        self._slots.append((*store.slot, TYPES.index("f")))
+        element: Any
+        kind, array, element, *others = store.row
+        place, before = self._place(self._rows, store.row), (kind, array, element - 1, *others)
         last = self._steps[-1] if self._steps else None
         if last is not None and last.operation == "store_floats":
             first, count = last.others
-            array, element, _ = store.slot
-            if (first + count, last.extra + count) == (row, slot) and self._slots[-2][:2] == (
-                array,
-                element - 1,
-            ):
+            are_neighbours = self._rows.get(before) == place - 1
+            if are_neighbours and (first + count, last.extra + count) == (row, place):
                 self._steps[-1] = last._replace(others=(first, count + 1))
                 return
-        self._steps.append(_Step("store_floats", slot, None, (), (row, 1)))
+        self._steps.append(_Step("store_floats", place, None, (), (row, 1)))
 
     def store(self, store: Store) -> None:
         """Add the instruction that stores a value."""
-        if store.row is not None:
-            extra = self._place(self._rows, store.row)
-            self._steps.append(_Step("store_row", extra, None, (store.node,)))
-            return
-        letter = letter_of(self._graph.nodes[store.node].dtype)
-        self._slots.append((*store.slot, TYPES.index(letter)))
-        self._steps.append(_Step("store_seen", len(self._slots) - 1, None, (store.node,)))
+        extra = self._place(self._rows, store.row)
+        self._steps.append(_Step("store_row", extra, None, (store.node,)))
 
     def _place(self, places: dict[Any, int], key: Any) -> int:
         return places.setdefault(key, len(places))
@@ -156,7 +140,7 @@ class _Compiler:
                 return "load_row", self._place(self._rows, what)
             case "action" | "previous_action":
                 return "load_row", self._place(self._rows, (node.kind, what))
-            case "active" | "stopped":
+            case "failed" | "stopped":
                 return f"load_{node.kind}", 0
             case "take" | "interpolate":
                 return node.kind, self._place(self._tables, what)
@@ -167,11 +151,11 @@ class _Compiler:
             return "cast", TYPES.index(source) * len(TYPES) + TYPES.index(letter_of(node.dtype))
         return str(operation_of(what, source)), 0
 
-    def program(self, results: Sequence[int], seen: int) -> Program:
+    def program(self) -> Program:
         """Place all values in registers."""
         self._steps = _with_pairs(self._steps)
         registers = registers_of(
-            [(step.node, step.operands) for step in self._steps], self._constants, results
+            [(step.node, step.operands) for step in self._steps], self._constants, ()
         )
         if max(registers.values(), default=0) >= MOST_REGISTERS:
             raise UncompilableError(f"it needs more than {MOST_REGISTERS} values at a time")
@@ -184,12 +168,9 @@ class _Compiler:
         return Program(
             code,
             self._constants_in(registers),
-            np.array(self._slots, SLOT),
             tuple(self._rows),
             tuple(self._graph.tables[key] for key in self._tables),
             max(registers.values(), default=-1) + 1,
-            seen,
-            tuple(registers[node] for node in results),
         )
 
     def _constants_in(self, registers: dict[int, int]) -> Any:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +30,8 @@ __all__ = [
     "operation_of",
 ]
 
+T = TypeVar("T")
+
 _OF_EACH_TYPE: Final = (
     *("add", "subtract", "multiply", "negative", "minimum", "maximum"),
     *("less", "less_equal", "greater", "greater_equal", "equal", "not_equal"),
@@ -43,8 +45,8 @@ _FUNCTIONS: Final = (
 """Functions of the C library, whose last bits may differ from numpy's."""
 
 OPERATIONS: Final = (
-    *("load_row", "load_active", "load_stopped"),
-    *("store_row", "store_seen", "store_floats", "cast", "take", "interpolate"),
+    *("load_row", "load_failed", "load_stopped"),
+    *("store_row", "store_floats", "cast", "take", "interpolate"),
     *(f"{name} {letter}" for letter in "dfq" for name in _OF_EACH_TYPE),
     *(f"{name} {letter}" for name in ("divide", "absolute", "sqrt") for letter in "df"),
     *("floor d", "ceil d", "trunc d", "rint d"),
@@ -66,8 +68,7 @@ MOST_REGISTERS: Final = 256
 """The native pool has this many registers for each program."""
 
 CONSTANT: Final = np.dtype([("bits", "u8"), ("to", "u2"), ("size", "u2"), ("unused", "u4")])
-SLOT: Final = np.dtype([("array", "u4"), ("element", "u4"), ("elements", "u4"), ("type", "u4")])
-"""The layouts of ``Constant`` and ``Slot`` in ``native/program.h``."""
+"""The layout of ``Constant`` in ``native/program.h``."""
 
 
 def require_same_table(native: Any) -> None:
@@ -147,28 +148,22 @@ Row = tuple[Hashable, ...]
 
 @dataclass(frozen=True)
 class Program:
-    """Instructions for the native pool.
+    """Instructions for the native pool: a function from rows to rows, element by element.
 
     Attributes:
         code: Operation, extra, the register to write, three operands; shape (n, 6). What extra
             means depends on the operation; see ``native/program.h``.
         constants: Registers that keep a value; of type ``CONSTANT``.
-        slots: Elements of observations that are stored; of type ``SLOT``.
         rows: The rows that are loaded or stored.
         tables: Values to look up.
         registers: How many registers there are.
-        seen: How many arrays the slots refer to.
-        results: The registers of the results.
     """
 
     code: npt.NDArray[np.uint16]
     constants: npt.NDArray[Any]
-    slots: npt.NDArray[Any]
     rows: tuple[Row, ...]
     tables: tuple[npt.NDArray[Any], ...]
     registers: int
-    seen: int
-    results: tuple[int, ...]
 
     def loads(self, kind: str) -> bool:
         """Whether the program loads or stores rows of this kind."""
@@ -178,17 +173,8 @@ class Program:
         """Return the program with other tables, by the bytes of the tables that they replace."""
         return replace(self, tables=tuple(tables.get(own.tobytes(), own) for own in self.tables))
 
-    def with_rows(
-        self, find: Callable[[Row], npt.NDArray[Any]]
-    ) -> tuple[bytes, tuple[npt.NDArray[Any], ...]]:
-        """The program as the native pool takes it: its form, and the arrays of its rows."""
-        form = form_of_program(
-            self.code.tobytes(),
-            self.constants.tobytes(),
-            self.slots.tobytes(),
-            self.tables,
-            self.registers,
-            self.seen,
-            self.results,
-        )
+    def with_rows(self, find: Callable[[Row], T]) -> tuple[bytes, tuple[T, ...]]:
+        """The program as the native pool takes it: its form, and what it finds for its rows."""
+        code, constants = self.code.tobytes(), self.constants.tobytes()
+        form = form_of_program(code, constants, self.tables, self.registers)
         return form, tuple(map(find, self.rows))

@@ -503,28 +503,18 @@ def _write_loop(writer: Writer, loop: Loop | None, label: str) -> None:
 def form_of_program(
     code: bytes,
     constants: bytes,
-    slots: bytes,
     tables: Sequence[Any],
     registers: int,
-    seen: int,
-    results: Sequence[int],
 ) -> bytes:
     """The form of a program; see ``fmugym.expressions.program``.
 
     Args:
         code: The instructions.
         constants: Registers that keep a value.
-        slots: Elements of observations that are stored.
         tables: Values to look up.
         registers: How many registers there are.
-        seen: How many arrays the slots refer to.
-        results: The registers of the results.
     """
-    writer = Writer()
-    writer.integers(registers, seen)
-    for data in (code, constants, slots):
-        writer.block(data)
-    writer.array(results, np.int64)
+    writer = Writer().integers(registers).block(code).block(constants)
     writer.integers(len(tables))
     for table in tables:
         writer.integers(table.itemsize)

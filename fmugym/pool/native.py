@@ -280,11 +280,11 @@ class NativePool(EnginePool):
 def prepare(
     pool: _native.Pool,
     start: _native.Access,
-    programs: tuple[tuple[Any, ...], tuple[Any, ...]],
+    programs: Sequence[tuple[Any, ...]],
     actions: Mapping[str, Any],
     start_values: FloatArray,
     draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
-    episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
+    ended: MaskArray,
     surroundings: Mapping[str, Any],
 ) -> None:
     """Prepare a pool for steps of a vector environment, hooks included.
@@ -294,8 +294,8 @@ def prepare(
     Args:
         pool: The pool.
         start: To the start variables, as for ``Pool.reset``.
-        programs: From the actions to the inputs; from the outputs to done, truncated, reward.
-            See ``Program.with_rows``.
+        programs: From the actions to the inputs; from the outputs to all that follows; and from
+            those at the start of an episode to observations and infos. See ``Program.with_rows``.
         actions: How actions are checked and kept: the shape of one action; the letter of its
             type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
             from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
@@ -304,31 +304,27 @@ def prepare(
         start_values: As the values of ``reset``; the pool writes the draws there.
         draws: The draws of an episode, and the random streams, shape (N, 6); see
             ``EpisodeStreams``.
-        episodes: Steps of each episode, shape (N,); which environments start an episode in
-            the next step, shape (N,); steps after which an episode is truncated.
+        ended: Which environments start an episode in the next step, shape (N,).
         surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether the second
-            program reads them; ``done``, for where the latest step has ended the task, shape (N,),
-            or None; ``before_inputs`` and ``before_conclusion``, pairs of rows: values, and where
-            they are kept before a program replaces them; ``starts``, pairs of rows and what they
-            hold at the start of an episode, in this order, see ``fmugym.pool.play_form.RowStart``.
+            program reads them; ``before_inputs`` and ``before_conclusion``, pairs of rows: values,
+            and where they are kept before a program replaces them; ``starts``, pairs of rows and
+            what they hold at the start of an episode, in this order, see ``RowStart``;
             ``results``, whether to return numbers in the place of arrays of one; and the shape and
-            type of each array: float32 observations, or those that the second program stores, then
-            rewards, terminated and truncated of a step, mask and drawn values (draws, N) of a
-            reset.
+            type of each array: ``seen`` of observations and infos, which the pool fills with
+            float32 if no program does, then rewards, terminated and truncated of a step, mask and
+            drawn values (draws, N) of a reset.
     """
-    counts, ended, limit = episodes
     rows = Rows()
     pool.prepare_play(
-        form=form_of_play(rows, programs, actions, limit, surroundings),
+        form=form_of_play(rows, programs, actions, surroundings),
         rows=tuple(rows.arrays),
         start=start,
         start_values=start_values,
         draws=draws[0],
         states=draws[1],
-        step_counts=counts,
         ended=ended,
         **{name: actions[name] for name in ("shape", "letter", "current", "previous")},
-        **{name: surroundings[name] for name in ("kept", "done", "results")},
+        **{name: surroundings[name] for name in ("kept", "results")},
     )
 
 

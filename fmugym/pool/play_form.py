@@ -4,16 +4,33 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.form import Writer
 
-__all__ = ["RowStart", "Rows", "form_of_play"]
+__all__ = ["ArrayElement", "RowStart", "Rows", "form_of_play"]
 
 _Row = npt.NDArray[Any]
+
+
+class ArrayElement(NamedTuple):
+    """Row of a program in an array that each call brings, and in which the program only stores.
+
+    Attributes:
+        array: The number of the array among those of a call.
+        element: The place of the element in the part of an environment.
+        elements: How many elements this part has.
+        type: The place of its type in ``fmugym.expressions.program.TYPES``.
+    """
+
+    array: int
+    element: int
+    elements: int
+    type: int
+
 
 RowStart = bytes | _Row | int
 """The start of a row: the bytes of a constant, the values of another row, or a draw's number."""
@@ -22,21 +39,21 @@ RowStart = bytes | _Row | int
 class Rows:
     """Rows of memory that a form names by numbers.
 
-    Args:
-        rows: The first of them.
-
     Attributes:
         arrays: Those that have a number, in its order.
+        elements: Those in arrays of a call, which have the numbers from -1 downwards.
     """
 
-    def __init__(self, rows: Iterable[_Row] = ()) -> None:
+    def __init__(self) -> None:
         self.arrays: list[_Row] = []
+        self.elements: list[ArrayElement] = []
         self._numbers: dict[Any, int] = {}
-        for row in rows:
-            self.number(row)
 
-    def number(self, row: _Row) -> int:
-        """The number of the memory of a row, which gets one if it has none."""
+    def number(self, row: _Row | ArrayElement) -> int:
+        """The number of a row, which gets one if its memory has none."""
+        if isinstance(row, ArrayElement):
+            self.elements.append(row)
+            return -len(self.elements)
         memory = row.__array_interface__["data"][0], row.strides, row.dtype
         if memory not in self._numbers:
             self._numbers[memory] = len(self.arrays)
@@ -46,9 +63,8 @@ class Rows:
 
 def form_of_play(
     rows: Rows,
-    programs: Iterable[tuple[bytes, Iterable[_Row]]],
+    programs: Iterable[tuple[bytes, Iterable[_Row | ArrayElement]]],
     actions: Mapping[str, Any],
-    limit: int,
     surroundings: Mapping[str, Any],
 ) -> bytes:
     """The form of a play.
@@ -57,11 +73,10 @@ def form_of_play(
         rows: Get numbers.
         programs: As for ``NativePool.prepare_play``.
         actions: As for ``NativePool.prepare_play``.
-        limit: Steps after which an episode is truncated.
         surroundings: As for ``NativePool.prepare_play``.
     """
     number, none = rows.number, actions["none"]
-    writer = Writer().integers(surroundings["reads_kept"], limit, none.size)
+    writer = Writer().integers(surroundings["reads_kept"], surroundings["seen"], none.size)
     writer.integers(*(actions[name] for name in ("size", "check", "lowest", "highest")))
     writer.block(none.tobytes())
     for moment in ("before_inputs", "before_conclusion"):
@@ -69,8 +84,10 @@ def form_of_play(
         writer.array([[number(source), number(to)] for source, to in pairs], np.int64)
     starts = surroundings["starts"]
     writer.array([(number(row), *_start_of(rows, source)) for row, source in starts], np.int64)
-    for form, own in programs:
-        writer.block(form).array(list(map(number, own)), np.int64)
+    inputs, *others = [(form, list(map(number, own))) for form, own in programs]
+    writer.block(inputs[0]).array(inputs[1], np.int64).array(rows.elements, np.int64)
+    for form, numbers in others:
+        writer.block(form).array(numbers, np.int64)
     return writer.form()
 
 

@@ -74,13 +74,13 @@ class Surrogate:
             rows_in(graph, "x", len(self.terms.mean)), _rows_of_numbers(graph, numbers)
         )
         stores = [Store(one.node, ("factor", i)) for i, one in enumerate(factors)]
-        found = [compile_graph(graph, stores, [], 0)]
+        found = [compile_graph(graph, stores)]
         for place, weights in enumerate(self.weights.tolist()):
             graph = Graph()
             now = Value.read(graph, "x", place, dtype=np.float64)
             seen = rows_in(graph, "factor", len(factors))
             total = self._next(place, now, seen, [*map(_rows_of_numbers(graph, numbers), weights)])
-            found.append(compile_graph(graph, [Store(total.node, ("next", place))], [], 0))
+            found.append(compile_graph(graph, [Store(total.node, ("next", place))]))
         return found, numbers
 
     def _next(
@@ -114,7 +114,7 @@ class Surrogate:
 
         def run() -> None:
             for one in parts:
-                engine().evaluate(one, count, (), ())
+                engine().evaluate(one, count)
 
         return run
 

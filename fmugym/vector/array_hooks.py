@@ -33,17 +33,18 @@ class ArrayHooks(Expressions):
     """Task of hooks on arrays, called before the step of the FMUs and after it.
 
     Args:
-        env, max_episode_steps: See ``Expressions``.
+        env: See ``Expressions``.
+        limit: The steps after which an episode is truncated.
     """
 
     way = "arrays"
 
-    def __init__(self, env: FMUEnv, max_episode_steps: int | None) -> None:
+    def __init__(self, env: FMUEnv, limit: int) -> None:
         self._idle: MaskArray | None = None
         self._busy: MaskArray | None = None
         self._all = np.ones(env._instance.pool.num_instances, np.bool_)
-        programs = TaskPrograms.without_programs(env.variables, len(env.interface.inputs))
-        super().__init__(env, max_episode_steps, programs)
+        inputs = len(env.interface.inputs)
+        super().__init__(env, TaskPrograms.without_programs(env.variables, inputs, limit))
 
     def _prepare(self, programs: TaskPrograms) -> None:
         super()._prepare(programs)

@@ -83,18 +83,16 @@ class EpisodeArrays:
         index: Any = rest[-1]
         name: Any = rest[0]
         match kind:
-            case "output":
-                return self.quantities.outputs[index]
-            case "kept":
-                return self.kept[index]
-            case "input":
-                return self.quantities.inputs[index]
+            case "output" | "input":
+                return getattr(self.quantities, f"{kind}s")[index]
+            case "kept" | "given":
+                return getattr(self, kind)[index]
             case "parameter":
                 return self.parameters[name]
-            case "given":
-                return self.given[index]
             case "step_count":
                 return self.quantities.step_count
+            case "done" | "ended":
+                return getattr(self, kind)
             case "action" | "previous_action":
                 actions = self.actions[kind == "previous_action"]
                 return actions.reshape(self._n, -1)[:, index]

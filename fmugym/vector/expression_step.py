@@ -43,7 +43,7 @@ def expression_step_of(env: FMUEnv) -> ExpressionStep | None:
     if formulas is None:
         return None
     try:
-        return ExpressionStep(env, compile_formulas(env, formulas))
+        return ExpressionStep(env, compile_formulas(env, formulas, env.step_limit))
     except UncompilableError as reason:
         text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
         logger.info("%s. They are evaluated in Python, which is slower", text)
@@ -74,7 +74,6 @@ class ExpressionStep:
             task,
             starts,
             (no_draws(), (), np.zeros((1, 6), np.uint64)),
-            env.step_limit,
             (True, layout.shapes),
         )
         self._play: Any = play.step

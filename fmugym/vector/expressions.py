@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -46,17 +45,15 @@ class Expressions(VectorTask):
 
     Args:
         env: The prototype, made with a pool of N instances.
-        max_episode_steps: Truncates episodes, in addition to the config's own limit.
         programs: Those of the expressions.
     """
 
     way = "expressions"
     episodes: ArrayEpisodes
 
-    def __init__(self, env: FMUEnv, max_episode_steps: int | None, programs: TaskPrograms) -> None:
+    def __init__(self, env: FMUEnv, programs: TaskPrograms) -> None:
         super().__init__(ArrayEpisodes(env, env._instance.pool))
         self.env, self._n = env, self._pool.num_instances
-        self._limit = min(env.step_limit, max_episode_steps or sys.maxsize)
         self._prepare(programs)
 
     def rebind(self) -> None:
@@ -76,7 +73,6 @@ class Expressions(VectorTask):
             programs,
             episodes.start_values,
             (native or no_draws(), draws.drawn if native else (), episodes.streams.states),
-            self._limit,
             (False, layout.shapes),
         )
         starts, rows = env.config.episode_variables, episodes.arrays.variables

@@ -10,10 +10,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.expressions.program import LETTERS
+from fmugym.expressions.program import LETTERS, TYPES, Row
 from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.base import FloatArray, Play
-from fmugym.pool.play_form import RowStart
+from fmugym.pool.play_form import ArrayElement, RowStart
 from fmugym.task.episode_start import Draw
 from fmugym.vector.episode_arrays import EpisodeArrays, element_row
 from fmugym.vector.hooks.task_programs import TaskPrograms
@@ -22,6 +22,12 @@ __all__ = ["prepare_step"]
 
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
+
+_RESULTS: Final = {
+    kind: TYPES.index(letter)
+    for kind, letter in zip(("reward", "terminated", "truncated"), "d??", strict=True)
+}
+"""The types of the rows of results, in the order of their arrays after those of observations."""
 
 _KEPT_BY_THE_POOL: Final = frozenset({"previous_state", "previous_action"})
 """The quantities before the step that the pool keeps by itself, from ``kept`` and ``actions``."""
@@ -33,7 +39,6 @@ def prepare_step(
     task: TaskPrograms,
     starts: FloatArray,
     draws: tuple[Any, Sequence[Draw], npt.NDArray[np.uint64]],
-    limit: int,
     results: tuple[bool, tuple[Any, ...]],
 ) -> Play:
     """Give the pool of an environment everything it needs for steps.
@@ -44,30 +49,33 @@ def prepare_step(
         task: The programs; their variables are held.
         starts: The values of each parameter, a row each.
         draws: What draws values natively, what it draws, and the streams.
-        limit: The number of steps after which episodes are truncated.
         results: Whether the pool returns numbers of one environment, and the shapes and types of
             the arrays of observations and infos.
     """
     native, drawn, streams = draws
     count = len(arrays.ended)
-    are_of_one, shapes = results
+    are_of_one, seen = results
     flags, real = ((count,), arrays.done.dtype), np.dtype(np.float64)
-    judged = ((count,), real), flags, flags, flags
+    others = ((count,), real), flags, flags, flags, ((len(drawn), count), real)
+
+    def find(row: Row) -> Any:
+        kind = row[0]
+        if kind == "seen":
+            place: Any = row[1:]
+            return ArrayElement(*place)
+        if kind in _RESULTS:
+            return ArrayElement(len(seen) + [*_RESULTS].index(kind), 0, 1, _RESULTS[kind])
+        return arrays.find(row)
+
     return env._instance.pool.prepare_play(
         env.episode_start.model_variables,
-        (task.inputs.with_rows(arrays.find), task.conclusion.with_rows(arrays.find)),
+        [one.with_rows(find) for one in (task.inputs, task.conclusion, task.observation)],
         _actions(env, arrays),
         starts,
         (native, streams),
-        (arrays.quantities.step_count, arrays.ended, limit),
-        _surroundings(
-            env,
-            arrays,
-            task,
-            starts,
-            drawn,
-            (are_of_one, (*shapes, *judged, ((len(drawn), count), real))),
-        ),
+        arrays.ended,
+        _surroundings(env, arrays, task, starts, drawn)
+        | {"seen": len(seen), "results": (are_of_one, (*seen, *others))},
     )
 
 
@@ -98,9 +106,8 @@ def _surroundings(
     task: TaskPrograms,
     start_values: FloatArray,
     drawn: Sequence[Draw],
-    results: tuple[Any, ...],
 ) -> dict[str, Any]:
-    """Description of everything beside the programs; see ``NativePool.prepare_play``.
+    """Description of what else surrounds a step; see ``NativePool.prepare_play``.
 
     Args:
         env: The environment.
@@ -108,19 +115,16 @@ def _surroundings(
         task: The programs.
         start_values: The values of each parameter, a row each.
         drawn: What the pool draws.
-        results: Whether it returns numbers, and the shapes and types of its arrays.
     """
     count = len(arrays.ended)
     pairs = ((row, arrays.before[name]) for name, row in arrays.variables.items())
     flat = [(row.reshape(-1, count), before.reshape(-1, count)) for row, before in pairs]
     return {
         "kept": arrays.kept,
-        "done": arrays.done,
         "reads_kept": task.conclusion.loads("kept"),
         "before_inputs": tuple(_previous(arrays)),
         "before_conclusion": tuple(pair for rows in flat for pair in zip(*rows, strict=True)),
         "starts": tuple(_starts(env, arrays, start_values, drawn)),
-        "results": results,
     }
 
 
@@ -143,6 +147,7 @@ def _starts(
     draws, read = env.episode_start, arrays.quantities
     names, held = draws.parameter_names, arrays.variables
     yield arrays.done, b"\0"
+    yield read.step_count, b"\0"
     for row, (name, start) in zip(read.inputs, env.interface.start_inputs, strict=True):
         is_parameter = name in names
         yield row, start_values[names.index(name)] if is_parameter else np.float64(start).tobytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from typing import Any, Final
 
 from gymnasium import spaces
@@ -58,10 +59,11 @@ def make_task(
     """
     reason = _reason(prototype)
     if reason is None:
-        programs = _programs(prototype)
+        limit = min(prototype.step_limit, max_episode_steps or sys.maxsize)
+        programs = _programs(prototype, limit)
         if programs is None:
-            return ArrayHooks(prototype, max_episode_steps)
-        return Expressions(prototype, max_episode_steps, programs)
+            return ArrayHooks(prototype, limit)
+        return Expressions(prototype, programs)
     if pool.num_instances >= _MANY:
         warn_once(logger, f"the hooks of {type(prototype).__name__} are called {reason}")
     envs = _make_all(maker, prototype, pool.num_instances)
@@ -83,13 +85,13 @@ def require_own_order(env: FMUEnv) -> None:
         )
 
 
-def _programs(env: FMUEnv) -> TaskPrograms | None:
+def _programs(env: FMUEnv, limit: int) -> TaskPrograms | None:
     """The programs of an environment whose hooks are expressions."""
     formulas = formulas_of(env)
     if formulas is None:
         return None
     try:
-        return compile_formulas(env, formulas)
+        return compile_formulas(env, formulas, limit)
     except UncompilableError as reason:
         text = f"the expressions of {type(env).__name__} cannot be compiled: {reason}"
         logger.info("%s. They are evaluated on arrays, which is slower", text)

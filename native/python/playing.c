@@ -66,20 +66,19 @@ typedef struct {
     const char *form;
     Py_ssize_t size;
     PyObject *rows, *start, *start_values, *shape, *current, *previous, *draws, *states;
-    PyObject *step_counts, *ended, *kept, *done, *results;
+    PyObject *ended, *kept, *results;
     int letter;
 } Parts;
 
 static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
-    static char *names[] = {"form",        "rows",     "start", "start_values", "shape",
-                            "letter",      "current",  "previous", "draws",     "states",
-                            "step_counts", "ended",    "kept",  "done",         "results", NULL};
+    static char *names[] = {"form",    "rows",     "start", "start_values", "shape",
+                            "letter",  "current",  "previous", "draws",     "states",
+                            "ended",   "kept",     "results", NULL};
 
     return PyArg_ParseTupleAndKeywords(
-        args, kwargs, "$y#O!OOO!COOOOOOOOO:prepare_play", names, &p->form, &p->size, &PyTuple_Type,
+        args, kwargs, "$y#O!OOO!COOOOOOO:prepare_play", names, &p->form, &p->size, &PyTuple_Type,
         &p->rows, &p->start, &p->start_values, &PyTuple_Type, &p->shape, &p->letter, &p->current,
-        &p->previous, &p->draws, &p->states, &p->step_counts, &p->ended, &p->kept, &p->done,
-        &p->results);
+        &p->previous, &p->draws, &p->states, &p->ended, &p->kept, &p->results);
 }
 
 static bool take_form(PyPool *self, Playing *playing, const Parts *p) {
@@ -151,48 +150,52 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
     const Py_ssize_t n = (Py_ssize_t)s->count;
     Py_buffer *b = playing->buffers;
 
-    if (!take_vector(p->step_counts, &b[COUNTS], WRITTEN, "step_counts", ITEM_INT64, n) ||
-        !take_vector(p->ended, &b[ENDED], WRITTEN, "ended", ITEM_BOOLEAN, n) ||
+    if (!take_vector(p->ended, &b[ENDED], WRITTEN, "ended", ITEM_BOOLEAN, n) ||
         !take_matrix(p->kept, &b[KEPT], WRITTEN, "kept", ITEM_FLOAT64,
-                     (Py_ssize_t)s->outputs->count, n) ||
-        (p->done != Py_None &&
-         !take_vector(p->done, &b[DONE], WRITTEN, "done", ITEM_BOOLEAN, n))) {
+                     (Py_ssize_t)s->outputs->count, n)) {
         return false;
     }
-    play_settle(&playing->form, s, b[KEPT].buf, b[COUNTS].buf, b[ENDED].buf);
+    play_settle(&playing->form, s, b[KEPT].buf, b[ENDED].buf);
     playing->form.play.streams = b[STATES].buf;
-    playing->form.play.done = b[DONE].buf;
     return true;
 }
 
 bool pool_observes(const Playing *playing) {
-    return playing->form.conclusion.program.number_of_seen == 0 &&
-           results_number_of_seen(playing->results) == 1;
+    return playing->form.play.number_of_seen == 1 && playing->form.stored_sizes[0] == 0;
 }
 
 static bool results_fit(const PyPool *self, const Playing *playing) {
     const Settings *s = &self->pool.settings;
     const Results *r = playing->results;
-    const size_t seen = playing->form.conclusion.program.number_of_seen;
+    const Play *play = &playing->form.play;
+    const size_t drawn = play->draws->count * s->count * sizeof(double);
     bool fit = (s->count == 1 || !results_are_of_one(r)) &&
-               results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
-               results_size(r, TERMINATED_ARRAY) == s->count &&
-               results_size(r, TRUNCATED_ARRAY) == s->count &&
-               results_size(r, MASK_ARRAY) == s->count &&
-               results_size(r, DRAWN_ARRAY) ==
-                   playing->form.play.draws->count * s->count * sizeof(double);
+               results_number_of_seen(r) == play->number_of_seen &&
+               results_size(r, results_place(r, MASK_ARRAY)) == s->count &&
+               results_size(r, results_place(r, DRAWN_ARRAY)) == drawn;
 
+    for (size_t i = 0; fit && i < MOST_ARRAYS; i++) {
+        const size_t size = play->array_sizes[i];
+        fit = i < play->number_of_arrays ? size > 0 && results_size(r, i) == s->count * size
+                                         : size == 0;
+    }
+    return fit;
+}
+
+/* Notes how large the arrays must be that programs or the pool fill. */
+static void measure_arrays(const PyPool *self, Playing *playing) {
+    Play *play = &playing->form.play;
+
+    memcpy(play->array_sizes, playing->form.stored_sizes, sizeof play->array_sizes);
     if (pool_observes(playing)) {
-        return fit && results_size(r, 0) == s->count * s->num_observed * sizeof(float);
+        play->array_sizes[0] = self->pool.settings.num_observed * sizeof(float);
     }
-    for (size_t i = 0; i < seen && fit; i++) {
-        fit = results_size(r, i) == s->count * playing->form.conclusion.seen_sizes[i];
-    }
-    return fit && results_number_of_seen(r) == seen;
+    play->number_of_arrays = play->number_of_seen + STEP_ARRAYS;
 }
 
 static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
     playing->results = results_take(parts);
+    measure_arrays(self, playing);
     if (playing->results != NULL && !results_fit(self, playing)) {
         PyErr_SetString(PyExc_ValueError, "the arrays of results do not fit the pool");
         return false;

@@ -11,12 +11,10 @@
 enum {
     STARTS,
     STATES,
-    COUNTS,
     ENDED,
     CURRENT,
     PREVIOUS,
     KEPT,
-    DONE,
     PLAY_BUFFERS
 };
 
@@ -35,14 +33,13 @@ typedef struct {
 /* Of a capsule that prepare_play has made. */
 Playing *playing_of(PyObject *capsule);
 
-/* Whether the pool itself fills the observations, instead of the program. */
+/* Whether the pool itself fills the observations, instead of a program. */
 bool pool_observes(const Playing *playing);
 
 /* One call that plays: */
 
 typedef struct {
     Py_buffer actions;
-    size_t seen_sizes[MOST_SEEN];
     Turn turn;
     Call call;
     int64_t number; /* the action of the only environment, if it is an integer */

@@ -65,7 +65,6 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
     t->turn = (Turn){
         .play = &playing->form.play,
         .actions = t->actions.buf,
-        .seen_sizes = t->seen_sizes,
     };
     t->call = (Call){
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
@@ -113,10 +112,7 @@ bool is_outside(const PyTurn *t) {
 
 /* Lets the step fill the arrays that it returns. */
 static void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
-    t->turn.rewards = (double *)(void *)arrays->memory[REWARDS_ARRAY];
-    t->turn.terminated = (uint8_t *)arrays->memory[TERMINATED_ARRAY];
-    t->turn.truncated = (uint8_t *)arrays->memory[TRUNCATED_ARRAY];
-    t->turn.seen = arrays->memory;
+    t->turn.arrays = arrays->memory;
     if (pool_observes(playing)) {
         t->call.observations = (float *)(void *)arrays->memory[0];
     }
@@ -124,20 +120,17 @@ static void settle_results(const Playing *playing, const ResultArrays *arrays, P
 
 /* Lets episodes start where others have ended before this step. */
 static void settle_starts(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
-    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
-    memcpy(arrays->memory[MASK_ARRAY], playing->form.play.ended, playing->form.play.count);
+    const Results *r = playing->results;
+    const Play *play = &playing->form.play;
+
+    t->turn.drawn = (double *)(void *)arrays->memory[results_place(r, DRAWN_ARRAY)];
+    memcpy(arrays->memory[results_place(r, MASK_ARRAY)], play->ended, play->count);
 }
 
 /* Lets them also start where others end in this step. */
 static void settle_starts_at_ends(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
-    t->turn.last_seen = arrays->last_memory;
-    if (pool_observes(playing)) {
-        t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
-    }
-    t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
-    for (size_t i = 0; i < playing->form.conclusion.program.number_of_seen; i++) {
-        t->seen_sizes[i] = playing->form.conclusion.seen_sizes[i];
-    }
+    t->turn.last = arrays->last_memory;
+    t->turn.started = (uint8_t *)arrays->memory[results_place(playing->results, MASK_ARRAY)];
 }
 
 static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {

@@ -31,10 +31,12 @@ static PyObject *mask_of(PyObject *options) {
 
 static void settle_reset(PyPool *self, const Playing *playing, const ResultArrays *arrays,
                          PyTurn *t) {
+    const Results *r = playing->results;
+
     settle_turn(self, playing, t);
-    t->call.mask = (Mask){arrays->memory[MASK_ARRAY], 1};
-    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
-    t->turn.seen = arrays->memory;
+    t->call.mask = (Mask){arrays->memory[results_place(r, MASK_ARRAY)], 1};
+    t->turn.drawn = (double *)(void *)arrays->memory[results_place(r, DRAWN_ARRAY)];
+    t->turn.arrays = arrays->memory;
     if (pool_observes(playing)) {
         t->call.observations = (float *)(void *)arrays->memory[0];
     }

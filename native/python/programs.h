@@ -20,11 +20,6 @@ typedef struct {
 bool take_rows(PyObject *tuple, Py_ssize_t length, PyRows *rows);
 void release_rows(PyRows *rows);
 
-/* Takes the arrays that a program stores observations of count environments in: a tuple, the values of a
- * dict, or the only one. There is room for MOST_SEEN. */
-bool take_seen(const ProgramForm *program, size_t count, PyObject *arrays, Py_buffer *buffers,
-               char **seen);
-
 /* Takes a vector with any type of numbers. */
 bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char *name,
                   Py_ssize_t length);

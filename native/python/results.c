@@ -16,18 +16,17 @@ struct Results {
 /* Taking over */
 
 static bool take_makers(Results *r, PyObject *shapes) {
-    const Py_ssize_t count = PyTuple_Size(shapes), judged = RESULT_ARRAYS - MOST_SEEN;
+    const Py_ssize_t count = PyTuple_Size(shapes), seen = count - OTHER_ARRAYS;
 
-    if (count < judged || count > RESULT_ARRAYS) {
+    if (seen < 0 || count > RESULT_ARRAYS) {
         PyErr_SetString(PyExc_ValueError, "results have too few or too many arrays");
         return false;
     }
-    r->number_of_seen = (size_t)(count - judged);
+    r->number_of_seen = (size_t)seen;
     for (Py_ssize_t i = 0; i < count; i++) {
-        const Py_ssize_t later = i - (count - judged);
         PyObject *arguments = PyTuple_GetItem(shapes, i);
-        if (!maker_take(&r->makers[later < 0 ? i : MOST_SEEN + later], arguments) ||
-            (later < 0 && !maker_take(&r->last[i], arguments))) {
+        if (!maker_take(&r->makers[i], arguments) ||
+            (i < seen && !maker_take(&r->last[i], arguments))) {
             return false;
         }
     }
@@ -75,6 +74,10 @@ size_t results_number_of_seen(const Results *r) {
     return r->number_of_seen;
 }
 
+size_t results_place(const Results *r, size_t other) {
+    return r->number_of_seen + other;
+}
+
 size_t results_size(const Results *r, size_t array) {
     return r->makers[array].size;
 }
@@ -93,15 +96,17 @@ static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) 
 
 /* Whatever fails, all arrays can be dropped. */
 static void clear(const Results *r, ResultArrays *a) {
-    memset(a->arrays, 0, r->number_of_seen * sizeof *a->arrays);
-    memset(a->arrays + MOST_SEEN, 0, (RESULT_ARRAYS - MOST_SEEN) * sizeof *a->arrays);
+    memset(a->arrays, 0, results_place(r, OTHER_ARRAYS) * sizeof *a->arrays);
     memset(a->last, 0, r->number_of_seen * sizeof *a->last);
 }
 
 bool results_provide_step(Results *r, ResultArrays *a) {
     clear(r, a);
-    return provide_some(r, 0, r->number_of_seen, a) &&
-           provide_some(r, REWARDS_ARRAY, TRUNCATED_ARRAY + 1, a);
+    return provide_some(r, 0, results_place(r, STEP_ARRAYS), a);
+}
+
+static bool provide_others(Results *r, ResultArrays *a) {
+    return provide_some(r, results_place(r, MASK_ARRAY), results_place(r, OTHER_ARRAYS), a);
 }
 
 static bool provide_last(Results *r, ResultArrays *a) {
@@ -116,34 +121,33 @@ static bool provide_last(Results *r, ResultArrays *a) {
 }
 
 bool results_provide_starts(Results *r, bool at_ends, ResultArrays *a) {
-    return (!at_ends || provide_last(r, a)) && provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
+    return (!at_ends || provide_last(r, a)) && provide_others(r, a);
 }
 
 bool results_provide_reset(Results *r, ResultArrays *a) {
     clear(r, a);
-    return provide_some(r, 0, r->number_of_seen, a) &&
-           provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
+    return provide_some(r, 0, r->number_of_seen, a) && provide_others(r, a);
 }
 
 void results_drop(const Results *r, ResultArrays *a) {
-    for (size_t i = 0; i < r->number_of_seen; i++) {
+    for (size_t i = 0; i < results_place(r, OTHER_ARRAYS); i++) {
         Py_XDECREF(a->arrays[i]);
-        Py_XDECREF(a->last[i]);
     }
-    for (size_t i = MOST_SEEN; i < RESULT_ARRAYS; i++) {
-        Py_XDECREF(a->arrays[i]);
+    for (size_t i = 0; i < r->number_of_seen; i++) {
+        Py_XDECREF(a->last[i]);
     }
 }
 
 bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) {
-    const Maker *own = &r->makers[MASK_ARRAY];
+    const size_t place = results_place(r, MASK_ARRAY);
+    const Maker *own = &r->makers[place];
     const char *memory = maker_memory_of(own, mask);
 
     if (memory == NULL) {
         return false;
     }
-    memcpy(a->memory[MASK_ARRAY], memory, own->size);
-    return memchr(a->memory[MASK_ARRAY], 1, own->size) != NULL;
+    memcpy(a->memory[place], memory, own->size);
+    return memchr(a->memory[place], 1, own->size) != NULL;
 }
 
 /* Returning */
@@ -157,13 +161,17 @@ static PyObject *seen_of(const Results *r, PyObject *const *arrays) {
     return seen;
 }
 
+static PyObject *other_of(const Results *r, const ResultArrays *a, size_t other) {
+    return Py_NewRef(a->arrays[results_place(r, other)]);
+}
+
 /* The rewards, or where episodes have ended; of a single environment a number. */
-static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t array) {
+static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t other) {
     if (!r->are_of_one) {
-        return Py_NewRef(a->arrays[array]);
+        return other_of(r, a, other);
     }
-    const char *memory = a->memory[array];
-    return array == REWARDS_ARRAY ? PyFloat_FromDouble(*(const double *)(const void *)memory)
+    const char *memory = a->memory[results_place(r, other)];
+    return other == REWARDS_ARRAY ? PyFloat_FromDouble(*(const double *)(const void *)memory)
                                   : PyBool_FromLong(*memory);
 }
 
@@ -187,8 +195,8 @@ static PyObject *tuple_of(PyObject *const *parts, Py_ssize_t count) {
 
 static PyObject *starts_of(const Results *r, const ResultArrays *a, bool at_ends) {
     PyObject *const parts[] = {
-        Py_NewRef(a->arrays[MASK_ARRAY]),
-        Py_NewRef(a->arrays[DRAWN_ARRAY]),
+        other_of(r, a, MASK_ARRAY),
+        other_of(r, a, DRAWN_ARRAY),
         at_ends ? seen_of(r, a->last) : Py_NewRef(Py_None),
     };
     return tuple_of(parts, sizeof parts / sizeof *parts);
@@ -212,8 +220,8 @@ PyObject *results_of_reset(const Results *r, const ResultArrays *a, size_t troub
                            bool any_ended) {
     PyObject *const parts[] = {
         PyLong_FromSize_t(troubled),         PyBool_FromLong(any_ended),
-        seen_of(r, a->arrays),               Py_NewRef(a->arrays[MASK_ARRAY]),
-        Py_NewRef(a->arrays[DRAWN_ARRAY]),
+        seen_of(r, a->arrays),               other_of(r, a, MASK_ARRAY),
+        other_of(r, a, DRAWN_ARRAY),
     };
     return tuple_of(parts, sizeof parts / sizeof *parts);
 }

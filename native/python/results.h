@@ -6,19 +6,16 @@
 #include "python.h"
 #include "program.h"
 
-enum {
-    REWARDS_ARRAY = MOST_SEEN,
-    TERMINATED_ARRAY,
-    TRUNCATED_ARRAY,
-    MASK_ARRAY,
-    DRAWN_ARRAY,
-    RESULT_ARRAYS
-};
+/* After the arrays of observations and infos come those that only a step has, then those that only
+ * starts of episodes have. */
+enum { REWARDS_ARRAY, TERMINATED_ARRAY, TRUNCATED_ARRAY, STEP_ARRAYS };
+enum { MASK_ARRAY = STEP_ARRAYS, DRAWN_ARRAY, OTHER_ARRAYS };
+enum { MOST_SEEN = MOST_ARRAYS - STEP_ARRAYS, RESULT_ARRAYS = MOST_SEEN + OTHER_ARRAYS };
 
 typedef struct Results Results;
 
-/* The arrays of one step or reset, and their memory. Those of observations and infos come first. If
- * episodes start where others end, there are more of these, for the last observations. */
+/* The arrays of one step or reset, and their memory. If episodes start where others end, there are
+ * more of observations and infos, for the last ones. */
 typedef struct {
     PyObject *arrays[RESULT_ARRAYS], *last[MOST_SEEN];
     char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
@@ -33,6 +30,8 @@ void results_free(Results *results);
 /* Whether they are of a single environment. */
 bool results_are_of_one(const Results *results);
 size_t results_number_of_seen(const Results *results);
+/* The place of one of the other arrays. */
+size_t results_place(const Results *results, size_t other);
 /* The bytes of an array. */
 size_t results_size(const Results *results, size_t array);
 

@@ -11,18 +11,29 @@ import pytest
 import zoo_tools
 from combinations import in_turn
 from process_tools import run_python
-from program_tools import DISCRETE, code, kept_actions, results_of, uniform_draws
+from program_tools import (
+    DISCRETE,
+    RESULT_ROWS,
+    code,
+    constants,
+    kept_actions,
+    no_observation,
+    results_of,
+    stored_results,
+    uniform_draws,
+)
 from test_native_pool import LOG, make, on_linux
 from ways import in_way
 
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
-from fmugym.expressions.program import CONSTANT, SLOT
+from fmugym.expressions.program import CONSTANT, TYPES
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
+from fmugym.pool.play_form import ArrayElement
 from fmugym.pool.recorded_inputs import inputs_in
 
 
@@ -191,24 +202,20 @@ class TestStates:
 # Programs
 
 
-def program(*rows, numbers=(), results=(), registers=4, seen=0, slots=(), tables=(), **changes):
+def program(*rows, numbers=(), registers=4, tables=(), **changes):
     """A program with rows of operation, extra, register to write, and three operands."""
-    parts = {
-        "code": code(*rows),
-        "constants": b"",
-        "slots": np.array(list(slots), SLOT).tobytes(),
-        "tables": tables,
-        "registers": registers,
-        "seen": seen,
-        "results": results,
-    }
+    parts = {"code": code(*rows), "constants": b"", "tables": tables, "registers": registers}
     return form_of_program(**(parts | changes)), tuple(numbers)
+
+
+def conclusion(*rows, first=0):
+    """A program that stores zeros as results, in rows from this number on."""
+    return program(*stored_results(first, 0, 0, 0), constants=constants(0.0), numbers=rows)
 
 
 def surroundings(pool):
     return {
         "kept": np.zeros_like(pool.outputs),
-        "done": None,
         "reads_kept": False,
         "before_inputs": (),
         "before_conclusion": (),
@@ -216,35 +223,34 @@ def surroundings(pool):
     }
 
 
-def prepare(pool, inputs, conclusion=None, rows=(0,), draws=None, **changes):
+def prepare(pool, inputs, concluding=None, rows=(0,), draws=None, observation=None, **changes):
     n = pool.num_instances
-    results = results_of(n, pool.observations.shape[1], len(rows))
     return pool.prepare_play(
         (pool.variable("theta_0"),),
-        (inputs, conclusion or program(results=(0, 0, 0))),
+        (inputs, concluding or conclusion(*RESULT_ROWS), observation or no_observation()),
         DISCRETE | kept_actions(n) | changes.pop("actions", {}),
         np.zeros((1, n)),
         draws or (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
-        (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
-        surroundings(pool) | {"results": results} | changes,
+        np.ones(n, np.bool_),
+        surroundings(pool) | results_of(n, pool.observations.shape[1], len(rows)) | changes,
     )
 
 
-ACTIVE = ("load_active",)
+FAILED = ("load_failed",)
+FLOAT, DOUBLE = TYPES.index("f"), TYPES.index("d")
 
 
 class TestPrograms:
     def test_a_sound_one(self, cart_poles):
-        prepare(cart_poles, program(ACTIVE))
+        prepare(cart_poles, program(FAILED))
 
     @pytest.mark.parametrize(
         "row",
         [
-            ("load_active", 1),
+            ("load_failed", 1),
             ("load_stopped", 60000),
             ("load_row", 0, 1),
             ("store_row", 0, 0, 1),
-            ("store_seen", 0, 0, 1),
             ("store_floats", 0, 0, 0, 1),
             ("cast", 144, 1),
             ("take", 0, 1),
@@ -260,23 +266,15 @@ class TestPrograms:
     )
     def test_operands_that_an_operation_does_not_have(self, cart_poles, row):
         with pytest.raises(ValueError, match="the form of a play is damaged"):
-            prepare(cart_poles, program(ACTIVE, row))
+            prepare(cart_poles, program(FAILED, row))
 
     @pytest.mark.parametrize(
         "changes",
         [
             {"code": b"1"},
             {"constants": b"12345678901234567"},
-            {"slots": b"1"},
             {"registers": 257},
             {"registers": 0},
-            {"results": (4,)},
-            {"results": (-1,)},
-            {"results": (0, 0, 0, 0)},
-            {"seen": 65},
-            {"slots": np.array([(1, 0, 1, 0)], SLOT).tobytes(), "seen": 1},
-            {"slots": np.array([(0, 1, 1, 0)], SLOT).tobytes(), "seen": 1},
-            {"slots": np.array([(0, 0, 1, 11)], SLOT).tobytes(), "seen": 1},
             {"constants": np.array([(0, 4, 8, 0)], CONSTANT).tobytes()},
             {"constants": np.array([(0, 0, 9, 0)], CONSTANT).tobytes()},
         ],
@@ -284,18 +282,18 @@ class TestPrograms:
     )
     def test_parts_that_do_not_fit(self, cart_poles, changes):
         with pytest.raises(ValueError, match="the form of a play is damaged"):
-            prepare(cart_poles, program(ACTIVE, **changes))
+            prepare(cart_poles, program(FAILED, **changes))
 
     @pytest.mark.parametrize(
         ("table", "name"), [(np.zeros(0), "take"), (np.zeros(5), "interpolate")]
     )
     def test_tables_that_are_too_short(self, cart_poles, table, name):
         with pytest.raises(ValueError, match="the form of a play is damaged"):
-            prepare(cart_poles, program(ACTIVE, (name, 0, 1), tables=(table,)))
+            prepare(cart_poles, program(FAILED, (name, 0, 1), tables=(table,)))
 
     def test_rows_of_another_length(self, cart_poles):
         with pytest.raises(ValueError, match="a row of a program must be a vector of"):
-            prepare(cart_poles, program(ACTIVE, numbers=(np.zeros(1),)))
+            prepare(cart_poles, program(FAILED, numbers=(np.zeros(1),)))
 
     @pytest.mark.parametrize(
         "actions",
@@ -309,7 +307,7 @@ class TestPrograms:
     )
     def test_actions_that_do_not_fit(self, cart_poles, actions):
         with pytest.raises(ValueError, match="action"):
-            prepare(cart_poles, program(ACTIVE), actions=actions)
+            prepare(cart_poles, program(FAILED), actions=actions)
 
     @pytest.mark.parametrize(
         "changes",
@@ -321,27 +319,62 @@ class TestPrograms:
             {"starts": ((np.zeros(3), b"1"),)},
             {"starts": ((np.zeros(6), np.zeros(6, "f4")),)},
             {"kept": np.zeros((1, 1))},
-            {"done": np.zeros(1, np.bool_)},
-            {"done": np.zeros(6)},
         ],
         ids=str,
     )
     def test_surroundings_that_do_not_fit(self, cart_poles, changes):
         with pytest.raises((TypeError, ValueError), match=r"must|differ|fit|float64"):
-            prepare(cart_poles, program(ACTIVE), **changes)
+            prepare(cart_poles, program(FAILED), **changes)
+
+    @pytest.mark.parametrize(
+        "rows",
+        [
+            [ArrayElement(67, 0, 1, DOUBLE)],
+            [ArrayElement(-1, 0, 1, DOUBLE)],
+            [ArrayElement(4, 0, 1, DOUBLE)],
+            [ArrayElement(1, 1, 1, DOUBLE)],
+            [ArrayElement(1, 0, 2**40, DOUBLE)],
+            [ArrayElement(1, 0, 1, 5)],
+            [ArrayElement(1, 0, 1, FLOAT)],
+            [ArrayElement(0, 0, 2, FLOAT), ArrayElement(0, 0, 2, DOUBLE)],
+            [ArrayElement(0, 0, 3, FLOAT)],
+        ],
+        ids=str,
+    )
+    def test_elements_of_arrays_that_do_not_exist(self, cart_poles, rows):
+        """A conclusion that stores in them would write beyond the results."""
+        store_none = program(FAILED, numbers=(*rows, *RESULT_ROWS))
+        with pytest.raises(ValueError, match=r"damaged|do not fit"):
+            prepare(cart_poles, program(FAILED), store_none)
+
+    def test_results_that_no_program_stores(self, cart_poles):
+        with pytest.raises(ValueError, match="the arrays of results do not fit"):
+            prepare(cart_poles, program(FAILED), program(FAILED))
+
+    def test_results_where_there_are_none(self, cart_poles):
+        """Before a step there are no arrays, at the start of an episode only observations."""
+        with pytest.raises(ValueError, match="there is no such row"):
+            prepare(cart_poles, conclusion(*RESULT_ROWS))
+        with pytest.raises(ValueError, match="there is no such element"):
+            prepare(cart_poles, program(FAILED), observation=conclusion(*RESULT_ROWS))
+
+    def test_results_that_a_program_would_load(self, cart_poles):
+        loading = program(("load_row", 0, 0), numbers=RESULT_ROWS)
+        with pytest.raises(ValueError, match="its parts do not fit together"):
+            prepare(cart_poles, program(FAILED), loading)
 
     @pytest.mark.parametrize("row", [1, 2**40])
     def test_rows_beyond_the_start_values(self, cart_poles, row):
         """They say where in memory draws are written."""
-        prepare(cart_poles, program(ACTIVE), rows=(0, -1))
+        prepare(cart_poles, program(FAILED), rows=(0, -1))
         with pytest.raises(ValueError, match="a draw is for no start value"):
-            prepare(cart_poles, program(ACTIVE), rows=(row,))
+            prepare(cart_poles, program(FAILED), rows=(row,))
 
     def test_what_does_not_hold_draws(self, cart_poles):
         draws, states = uniform_draws(0), np.zeros((6, 6), np.uint64)
         for odd in ((draws, states[:, :5]), (draws, states.view(np.int64)), (b"", states)):
             with pytest.raises((TypeError, ValueError)):
-                prepare(cart_poles, program(ACTIVE), draws=odd)
+                prepare(cart_poles, program(FAILED), draws=odd)
 
 
 # Memory

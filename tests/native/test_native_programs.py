@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from program_tools import code, constants
 
-from fmugym.expressions.program import SLOT, TYPES
+from fmugym.expressions.program import TYPES
 from fmugym.pool.form import form_of_program
 
 LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
@@ -16,21 +16,12 @@ def cast(source, target):
     return TYPES.index(source) * len(TYPES) + TYPES.index(target)
 
 
-def evaluate(lines, rows, results=(), seen=(), kept=(), slots=(), tables=(), count=None):
+def evaluate(lines, rows, kept=(), tables=(), count=None):
     """Run a program whose first registers hold constants."""
     from fmugym import _native
 
-    form = form_of_program(
-        code(*lines),
-        constants(*kept),
-        np.array(list(slots), SLOT).tobytes(),
-        tables,
-        16,
-        len(seen),
-        range(len(kept), len(kept) + len(results)),
-    )
-    parts = form, tuple(rows)
-    return _native.evaluate(parts, count or len(rows[0]), tuple(results), tuple(seen))
+    form = form_of_program(code(*lines), constants(*kept), tables, 16)
+    return _native.evaluate((form, tuple(rows)), count or len(rows[0]))
 
 
 @pytest.mark.parametrize("n", LENGTHS)
@@ -50,15 +41,15 @@ def test_runs_of_any_length(n):
         ("less d", 0, 1, 9, 5),
         ("where 8", 0, 2, 1, 4, 7),
         ("cast", cast("d", "f"), 10, 2),
-        ("store_seen", 0, 0, 10),
+        ("store_row", 7, 0, 10),
         ("cast", cast("d", "f"), 11, 5),
-        ("store_seen", 1, 0, 11),
+        ("store_row", 8, 0, 11),
         ("store_row", 3, 0, 9),
+        ("store_row", 5, 0, 1),
+        ("store_row", 6, 0, 2),
     )
-    slots = (0, 0, 2, TYPES.index("f")), (0, 1, 2, TYPES.index("f"))
     stored = np.zeros(n)
-    rows = x, y, counts, stored, action
-    evaluate(lines, rows, (flags, numbers), (seen,), (3.0,), slots)
+    evaluate(lines, (x, y, counts, stored, action, flags, numbers, *seen.T), (3.0,))
     expected = np.array([math.tan(value) for value in x]) * 3.0
     chosen = np.where(expected < action, y, counts)
     np.testing.assert_array_equal(stored, expected)
@@ -87,33 +78,29 @@ def test_rows_that_a_program_both_reads_and_writes(n):
 def test_neighbouring_rows_become_neighbouring_elements(n):
     rows = np.random.default_rng(n).normal(size=(4, n)) * [[1.0], [1e30], [1e-50], [3.0]]
     seen = np.zeros((n, 5), np.float32)
-    slots = [(0, element, 5, TYPES.index("f")) for element in (1, 2, 3)]
-    evaluate((("store_floats", 0, 0, 1, 3),), rows, (), (seen,), (), slots)
+    evaluate((("store_floats", 4, 0, 1, 3),), (*rows, *seen.T[1:4]))
     expected = np.zeros((n, 5), np.float32)
     expected[:, 1:4] = rows[1:].T
     np.testing.assert_array_equal(seen, expected)
 
 
-FLOAT = TYPES.index("f")
-
-
 @pytest.mark.parametrize(
-    ("line", "slots"),
+    "line",
     [
-        (("store_floats", 0, 0, 0, 0), [(0, 0, 3, FLOAT)]),
-        (("store_floats", 0, 0, 0, 2), [(0, 0, 3, FLOAT)]),
-        (("store_floats", 0, 0, 1, 2), [(0, 0, 3, FLOAT), (0, 1, 3, FLOAT)]),
-        (("store_floats", 0, 0, 0, 2), [(0, 0, 3, FLOAT), (0, 2, 3, FLOAT)]),
-        (("store_floats", 0, 0, 0, 2), [(0, 0, 3, FLOAT), (0, 1, 3, TYPES.index("d"))]),
-        (("store_floats", 0, 0, 2, 1), [(0, 0, 3, FLOAT)]),
+        ("store_floats", 3, 0, 0, 0),  # none
+        ("store_floats", 5, 0, 0, 2),  # beyond the last row
+        ("store_floats", 3, 0, 1, 2),  # from a row of floats
+        ("store_floats", 4, 0, 0, 2),  # to elements with one between them
+        ("store_floats", 0, 0, 0, 1),  # to a row of doubles
+        ("store_floats", 3, 0, 2, 1),
     ],
     ids=str,
 )
-def test_neighbours_that_do_not_exist(line, slots):
+def test_neighbours_that_do_not_exist(line):
     rows = np.zeros(3), np.zeros(3), np.zeros(3, np.float32)
-    seen = np.zeros((3, 3), np.float32)
+    elements = np.zeros((3, 5), np.float32).T
     with pytest.raises(ValueError, match="a program is not sound"):
-        evaluate((line,), rows, (), (seen,), (), slots)
+        evaluate((line,), (*rows, *(elements[i] for i in (0, 1, 3))))
 
 
 def points(count, rng):

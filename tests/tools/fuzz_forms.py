@@ -24,10 +24,17 @@ from unittest import mock
 import numpy as np
 from fuzz_driver import Case, main, require
 from pool_tools import sampled
-from program_tools import code, constants, results_of, uniform_draws
+from program_tools import (
+    RESULT_ROWS,
+    code,
+    constants,
+    no_observation,
+    results_of,
+    stored_results,
+    uniform_draws,
+)
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
-from fmugym.expressions.program import SLOT
 from fmugym.pool import PoolSpec, native
 from fmugym.pool.form import (
     Files,
@@ -190,26 +197,17 @@ def program_form(rng):
         ("less d", 0, 1, 4, 3),
         ("where 8", 0, 2, 1, 4, 3),
         ("cast", 1, 5, 2),
-        ("store_seen", 0, 0, 5),
+        ("store_row", 2, 0, 5),
+        ("store_floats", 3, 0, 0, 2),
         ("store_row", 1, 0, 2),
     ]
-    form = form_of_program(
-        code(*rows),
-        constants(0.0),
-        np.array([(0, 0, 1, 1)], SLOT).tobytes(),
-        (np.arange(4.0),),
-        6,
-        1,
-        (1, 1, 2),
-    )
+    form = form_of_program(code(*rows), constants(0.0), (np.arange(4.0),), 6)
     form, n = damaged(rng, form), rng.choice((1, 130))
-    arrays = np.ones(n), np.ones(n)
-    results = np.zeros(n), np.zeros(n), np.zeros(n)
-    seen = np.zeros((n, 1), np.float32)
+    arrays = np.ones(n), np.ones(n), *np.zeros((n, 3), np.float32).T
 
     def play():
         with refusals():
-            _native.evaluate((form, arrays), n, results, (seen,))
+            _native.evaluate((form, arrays), n)
 
     return Case(play, "program")
 
@@ -217,15 +215,21 @@ def program_form(rng):
 def play_of(inputs, outputs):
     """The parts of a play: it passes the action on, and ends beyond an output of 1."""
     push, kept_actions = code(("load_row", 1, 0), ("store_row", 0, 0, 0)), np.zeros(N)
-    judge = code(("load_row", 0, 1), ("greater d", 0, 2, 1, 0))
+    ended = np.zeros(N, np.bool_)
+    judge = code(
+        ("load_row", 0, 1),
+        ("greater d", 0, 2, 1, 0),
+        *stored_results(1, 1, 2, 2),
+        ("store_row", 4, 0, 2),
+    )
     programs = (
-        (form_of_program(push, b"", b"", (), 1, 0, ()), (inputs[0], kept_actions)),
-        (form_of_program(judge, constants(1.0), b"", (), 3, 0, (2, 2, 1)), (outputs[0],)),
+        (form_of_program(push, b"", (), 1), (inputs[0], kept_actions)),
+        (form_of_program(judge, constants(1.0), (), 3), (outputs[0], *RESULT_ROWS, ended)),
+        no_observation(),
     )
     kept, variables = np.zeros_like(outputs), np.zeros((2, N))
     surroundings = {
         "kept": kept,
-        "done": None,
         "reads_kept": True,
         "before_inputs": (tuple(variables),),
         "before_conclusion": (tuple(variables),),
@@ -234,7 +238,7 @@ def play_of(inputs, outputs):
             (inputs[0], np.float64(0.5).tobytes()),
             (kept[0], outputs[0]),
         ),
-        "results": results_of(N, 1, 0),
+        **results_of(N, 1, 0),
     }
     actions = {
         "shape": (),
@@ -247,9 +251,8 @@ def play_of(inputs, outputs):
         "previous": np.zeros(N),
         "none": np.zeros(1),
     }
-    episodes = np.zeros(N, np.int64), np.zeros(N, np.bool_), 10
     streams = uniform_draws(), np.zeros((N, 6), np.uint64)
-    return programs, actions, np.zeros((0, N)), streams, episodes, surroundings
+    return programs, actions, np.zeros((0, N)), streams, ended, surroundings
 
 
 def play_form(rng):

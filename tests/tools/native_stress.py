@@ -32,10 +32,13 @@ import numpy as np
 from exchange_tools import exchange_fmu
 from program_tools import (
     DISCRETE,
+    RESULT_ROWS,
     code,
     constants,
     kept_actions,
+    no_observation,
     results_of,
+    stored_results,
     uniform_draws,
 )
 
@@ -55,7 +58,7 @@ ending = threading.Event()
 """Set when the interpreter is about to end: receivers are silent then, and temporary files go."""
 
 
-def programs(pool, variables, actions):
+def programs(pool, variables, actions, ended):
     """Programs that use the numbers of the pool, those from before, and the C library."""
     push = code(
         ("load_row", 1, 1),
@@ -70,11 +73,13 @@ def programs(pool, variables, actions):
         ("greater d", 0, 5, 4, 0),
         ("load_row", 2, 6),
         ("store_row", 1, 0, 4),
+        *stored_results(3, 4, 5, 1),
+        ("store_row", 6, 0, 5),
     )
-    rows = pool.outputs[0], variables[0], actions["previous"]
-    pushing = form_of_program(push, constants(3.0), b"", (), 4, 0, ())
-    judging = form_of_program(judge, constants(0.2, 0.0), b"", (), 7, 0, (5, 1, 4))
-    return (pushing, (pool.inputs[0], actions["current"])), (judging, rows)
+    rows = pool.outputs[0], variables[0], actions["previous"], *RESULT_ROWS, ended
+    pushing = form_of_program(push, constants(3.0), (), 4)
+    judging = form_of_program(judge, constants(0.2, 0.0), (), 7)
+    return (pushing, (pool.inputs[0], actions["current"])), (judging, rows), no_observation()
 
 
 DRAWS = uniform_draws(0)
@@ -156,17 +161,16 @@ class Subject:
 
     def prepare_play(self):
         variables, before = np.zeros((1, self.n)), np.zeros((1, self.n))
-        actions = kept_actions(self.n)
+        actions, ended = kept_actions(self.n), np.zeros(self.n, np.bool_)
         self.pool.prepare_play(
             self.start,
-            programs(self.pool, variables, actions),
+            programs(self.pool, variables, actions, ended),
             DISCRETE | actions,
             self.values.copy(),
             (DRAWS, self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)),
-            (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
+            ended,
             {
                 "kept": np.zeros_like(self.pool.outputs),
-                "done": np.zeros(self.n, np.bool_) if self.rng.random() < 0.5 else None,
                 "reads_kept": bool(self.rng.random() < 0.5),
                 "before_inputs": ((variables[0], before[0]),),
                 "before_conclusion": ((variables[0], before[0]),),
@@ -176,7 +180,7 @@ class Subject:
                     *((row, np.float64(0.0).tobytes()) for row in self.pool.inputs),
                     (before[0], variables[0]),
                 ),
-                "results": results_of(self.n, len(self.outputs), 1),
+                **results_of(self.n, len(self.outputs), 1),
             },
         )
 

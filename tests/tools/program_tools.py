@@ -3,8 +3,9 @@
 import numpy as np
 
 from fmugym import _native
-from fmugym.expressions.program import CONSTANT, OPERATIONS
-from fmugym.pool.form import form_of_draws
+from fmugym.expressions.program import CONSTANT, OPERATIONS, TYPES
+from fmugym.pool.form import form_of_draws, form_of_program
+from fmugym.pool.play_form import ArrayElement
 
 DISCRETE = {
     "shape": (),
@@ -43,7 +44,22 @@ def uniform_draws(*rows):
 
 
 def results_of(count, observed, draws):
-    """The form of what a step returns: a tuple, with so many observed outputs and draws."""
+    """What a step returns: a tuple, with so many outputs that the pool observes, and draws."""
     flags, seen = ((count,), bool), ((count, observed), np.float32)
     arrays = seen, ((count,), float), flags, flags, flags, ((draws, count), float)
-    return False, arrays
+    return {"seen": 1, "results": (False, arrays)}
+
+
+RESULT_ROWS = tuple(ArrayElement(place, 0, 1, TYPES.index(t)) for place, t in enumerate("d??", 1))
+"""The rows of rewards, terminated and truncated, after the observations."""
+
+
+def stored_results(first, reward, terminated, truncated):
+    """Instructions that store registers in ``RESULT_ROWS``, the first of which has this number."""
+    registers = enumerate((reward, terminated, truncated), first)
+    return [("store_row", row, 0, register) for row, register in registers]
+
+
+def no_observation():
+    """A program that stores nothing, as the pool makes the observations."""
+    return form_of_program(b"", b"", (), 0), ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -17,12 +18,22 @@ from fmugym.expressions.quantities import QUANTITIES
 from fmugym.expressions.value import Computed, Value, where
 from fmugym.task.own_hooks import is_overridden
 from fmugym.task.step import ORDER
-from fmugym.vector.hooks.task_programs import SeenArray, TaskPrograms, to_input_type
+from fmugym.vector.hooks.task_programs import (
+    SeenArray,
+    TaskPrograms,
+    counted,
+    ended,
+    seen_stores,
+    to_input_type,
+)
 
 __all__ = ["Translation", "compile_formulas", "formulas_of", "written_variables"]
 
 _DOUBLE: Final = np.dtype(np.float64)
 _FLAG: Final = np.dtype(np.bool_)
+
+_STATUSES: Final = ("failed", "stopped")
+"""Flags that the pool makes of the statuses of FMUs."""
 
 _Seen = tuple[SeenArray, list[Value]]
 """An array that a program stores, and its elements."""
@@ -35,12 +46,13 @@ def formulas_of(env: FMUEnv) -> Formulas | None:
     return None if is_own else env.formulas
 
 
-def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
+def compile_formulas(env: FMUEnv, formulas: Formulas, limit: int) -> TaskPrograms:
     """Make the programs of a task.
 
     Args:
         env: An environment of the task.
         formulas: What the task computes.
+        limit: The steps after which an episode is truncated.
 
     Raises:
         UncompilableError: If programs do not have its actions or observations, or it is too long.
@@ -48,16 +60,76 @@ def compile_formulas(env: FMUEnv, formulas: Formulas) -> TaskPrograms:
     if env._instance.tells:
         raise UncompilableError("the pool tells infos of its own")
     letter_of(np.dtype(env.action_space.dtype))
-    conclusion, seen, updated = _Conclusion(env, formulas).made()
+    conclusion, updated = _conclusion(env, formulas, limit)
+    observation, seen = _observation(env, formulas)
     types = dict.fromkeys(env.variables, _DOUBLE)
-    return TaskPrograms(_inputs(env, formulas), conclusion, seen, types, updated)
+    return TaskPrograms(_inputs(env, formulas), conclusion, observation, seen, types, updated)
 
 
 def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
     """The program from the action to the inputs."""
     graph = Graph()
     inputs = Translation(env, graph, has_stepped=False).inputs(formulas)
-    return compile_graph(graph, [Store(v.node, ("input", i)) for i, v in enumerate(inputs)], [], 0)
+    stores = [Store(value.node, ("input", i)) for i, value in enumerate(inputs)]
+    return compile_graph(graph, [*stores, counted(graph)])
+
+
+def _conclusion(env: FMUEnv, formulas: Formulas, limit: int) -> tuple[Program, tuple[str, ...]]:
+    """The program that follows the FMU's step, and the variables that it writes."""
+    graph = Graph()
+    fresh = Value(graph, graph.load("row", ("ended", 0), _FLAG))
+    failed, stopped = (Value(graph, graph.load(kind, None, _FLAG)) for kind in _STATUSES)
+    has_stepped: Value = np.logical_not(failed | fresh)
+    known = written_variables(env, graph, formulas.updates, has_stepped)
+    stores = [
+        Store(value.node, ("variable", name, *(places or [0])))
+        for (_, name, *places), value in known.items()
+    ]
+    updated = tuple(dict.fromkeys(name for _, name, *_ in known))
+    done = stopped
+    if formulas.terminated is not None:
+        done = Translation(env, graph, True, dict(known)).of(formulas.terminated) | stopped
+    values = Translation(env, graph, True, known | {("done",): done})
+    truncated, reward = (
+        values.of(one) if one is not None else Value.of(graph, default)
+        for one, default in ((formulas.truncated, False), (formulas.reward, 0.0))
+    )
+    shown = Translation(env, graph, True, known | {("done",): done & has_stepped})
+    for number, (_, elements) in enumerate(_seen(env, formulas, shown)):
+        stores += seen_stores(number, elements)
+    stores += ended(done, truncated, reward, limit)
+    return compile_graph(graph, stores), updated
+
+
+def _observation(env: FMUEnv, formulas: Formulas) -> tuple[Program, tuple[SeenArray, ...]]:
+    """The program of observations and infos at the start of an episode, and their arrays."""
+    graph = Graph()
+    values = Translation(env, graph, True, {("done",): Value.of(graph, False)})
+    seen = _seen(env, formulas, values)
+    stores = [seen_stores(number, elements) for number, (_, elements) in enumerate(seen)]
+    return compile_graph(graph, [*chain(*stores)]), tuple(array for array, _ in seen)
+
+
+def _seen(env: FMUEnv, formulas: Formulas, values: Translation) -> list[_Seen]:
+    """The info if there is one, and the observation unless the pool makes it."""
+    conversions = env._conversions
+    parts = [*_named(("info",), formulas.info, values)] if conversions.has_info else []
+    if conversions.pool_observes and not parts:
+        return []
+    elements = values.observation(formulas)
+    dtype = np.dtype(env.observation_space.dtype)
+    return [(SeenArray(("observation",), (len(elements),), dtype), elements), *parts]
+
+
+def _named(path: tuple[str, ...], part: Computed, values: Translation) -> Iterator[_Seen]:
+    """The values of an info, each with the names that lead to it."""
+    if isinstance(part, Mapping):
+        for name, one in part.items():
+            yield from _named((*path, name), one, values)
+        return
+    assert isinstance(part, Value)
+    value = values.of(part)
+    yield SeenArray(path, (), value.dtype), [value]
 
 
 class Translation:
@@ -175,7 +247,7 @@ class Translation:
 
 
 def written_variables(
-    env: FMUEnv, graph: Graph, updates: Sequence[Update]
+    env: FMUEnv, graph: Graph, updates: Sequence[Update], has_stepped: Value
 ) -> dict[tuple[Any, ...], Value]:
     """Values that updates write to episode variables; the others keep theirs without a step.
 
@@ -183,6 +255,7 @@ def written_variables(
         env: An environment of the task.
         graph: That of the program.
         updates: See ``Formulas``.
+        has_stepped: Where there was a step without a failure.
 
     Returns:
         The values by ``("variables", name)``, and the place of an element if there are several.
@@ -197,80 +270,4 @@ def written_variables(
             for place, one in enumerate(value):
                 written["variables", name, place] = values.of(one).number
     before = Translation(env, graph, True)
-    is_active = Value(graph, graph.load("active", None, _FLAG))
-    return {key: where(is_active, value, before.quantity(*key)) for key, value in written.items()}
-
-
-class _Conclusion:
-    """The program that follows the FMU's step.
-
-    Args:
-        env: An environment of the task.
-        formulas: What the task computes.
-    """
-
-    def __init__(self, env: FMUEnv, formulas: Formulas) -> None:
-        self._env, self._formulas, self._graph = env, formulas, Graph()
-        self._known: dict[Any, Value] = {}
-
-    def made(self) -> tuple[Program, tuple[SeenArray, ...], tuple[str, ...]]:
-        """The program, the arrays that it stores, and the variables that it writes."""
-        formulas, graph = self._formulas, self._graph
-        stores, updated = self._update()
-        done = self._told("stopped")
-        if formulas.terminated is not None:
-            done = self._values().of(formulas.terminated) | done
-        self._known["done",] = done
-        values = self._values()
-        truncated, reward = (
-            values.of(one) if one is not None else Value.of(graph, default)
-            for one, default in ((formulas.truncated, False), (formulas.reward, 0.0))
-        )
-        self._known["done",] = done & self._told("active")  # an episode starts elsewhere
-        seen = self._seen()
-        more = [
-            Store(value.node, None, (number, place, len(values)))
-            for number, (_, values) in enumerate(seen)
-            for place, value in enumerate(values)
-        ]
-        results = [done.node, truncated.node, reward.node]
-        program = compile_graph(graph, stores + more, results, len(seen))
-        return program, tuple(array for array, _ in seen), updated
-
-    def _values(self) -> Translation:
-        return Translation(self._env, self._graph, True, dict(self._known))
-
-    def _told(self, kind: str) -> Value:
-        """A flag that the pool sets: whether the FMU has ``stopped``, or is ``active``."""
-        return Value(self._graph, self._graph.load(kind, None, _FLAG))
-
-    def _update(self) -> tuple[list[Store], tuple[str, ...]]:
-        """Write variables."""
-        self._known |= written_variables(self._env, self._graph, self._formulas.updates)
-        stores = [
-            Store(value.node, ("variable", name, *(places or [0])))
-            for (_, name, *places), value in self._known.items()
-        ]
-        return stores, tuple(dict.fromkeys(name for _, name, *_ in self._known))
-
-    def _seen(self) -> list[_Seen]:
-        """The info if there is one, and the observation unless the pool makes it."""
-        env, values = self._env, self._values()
-        conversions, info = env._conversions, self._formulas.info
-        parts = [*_named(("info",), info, values)] if conversions.has_info else []
-        if conversions.pool_observes and not parts:
-            return []
-        elements = values.observation(self._formulas)
-        dtype = np.dtype(env.observation_space.dtype)
-        return [(SeenArray(("observation",), (len(elements),), dtype), elements), *parts]
-
-
-def _named(path: tuple[str, ...], part: Computed, values: Translation) -> Iterator[_Seen]:
-    """The values of an info, each with the names that lead to it."""
-    if isinstance(part, Mapping):
-        for name, one in part.items():
-            yield from _named((*path, name), one, values)
-        return
-    assert isinstance(part, Value)
-    value = values.of(part)
-    yield SeenArray(path, (), value.dtype), [value]
+    return {key: where(has_stepped, value, before.quantity(*key)) for key, value in written.items()}

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,10 +13,12 @@ import numpy.typing as npt
 from fmugym.archive.variable import Variable
 from fmugym.expressions.graph import Graph
 from fmugym.expressions.lowering import Store, compile_graph
-from fmugym.expressions.program import Program
+from fmugym.expressions.program import TYPES, Program, letter_of
 from fmugym.expressions.value import Value, where
 
-__all__ = ["SeenArray", "TaskPrograms", "to_input_type"]
+__all__ = ["SeenArray", "TaskPrograms", "counted", "ended", "seen_stores", "to_input_type"]
+
+_FLAG, _COUNT = np.dtype(np.bool_), np.dtype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -38,42 +41,99 @@ class TaskPrograms:
     """The programs of a task.
 
     Attributes:
-        inputs: From the action to the inputs.
-        conclusion: From the outputs to done, truncated and reward; it stores the episode variables,
-            the observation if it is not the default one, and the info.
-        seen: The arrays that the second program stores.
+        inputs: From the action to the inputs; it counts the step.
+        conclusion: From the outputs to the episode variables, the results of the step, and which
+            episodes have ended; and to the observation, if it is not the default one, and the info.
+        observation: To these two alone, at the start of an episode.
+        seen: The arrays of observations and infos that programs store.
         variables: The types of the episode variables by name.
         updated: The names of the variables that ``_update`` writes.
     """
 
     inputs: Program
     conclusion: Program
+    observation: Program
     seen: tuple[SeenArray, ...]
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
 
     @classmethod
-    def without_programs(cls, variables: Iterable[str], inputs: int) -> TaskPrograms:
+    def without_programs(cls, variables: Iterable[str], inputs: int, limit: int) -> TaskPrograms:
         """A task whose hooks run on arrays; programs pass on inputs, and that an FMU stops.
 
         Args:
             variables: The names of the episode variables, which are float64 at first.
             inputs: The number of inputs.
+            limit: The steps after which an episode is truncated.
         """
-        graph, flag = Graph(), np.dtype(np.bool_)
-        stopped = graph.load("stopped", None, flag)
-        others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
-        conclusion = compile_graph(graph, [], [stopped, *others], 0)
-        types = dict.fromkeys(variables, np.dtype(np.float64))
+        graph, real = Graph(), np.dtype(np.float64)
+        stopped = Value(graph, graph.load("stopped", None, _FLAG))
+        never, nothing = Value.of(graph, False), Value.of(graph, 0.0)
+        conclusion = compile_graph(graph, ended(stopped, never, nothing, limit))
         graph = Graph()
-        given = [graph.load("row", ("given", i), np.dtype(np.float64)) for i in range(inputs)]
+        given = [graph.load("row", ("given", i), real) for i in range(inputs)]
         stores = [Store(node, ("input", i)) for i, node in enumerate(given)]
-        return cls(compile_graph(graph, stores, [], 0), conclusion, (), types, ())
+        return cls(
+            compile_graph(graph, [*stores, counted(graph)]),
+            conclusion,
+            compile_graph(Graph(), []),
+            (),
+            dict.fromkeys(variables, real),
+            (),
+        )
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TaskPrograms:
         """The same task with other tables, by the bytes of those whose place they take."""
-        inputs, conclusion = (one.with_tables(tables) for one in (self.inputs, self.conclusion))
-        return replace(self, inputs=inputs, conclusion=conclusion)
+        programs = (self.inputs, self.conclusion, self.observation)
+        inputs, conclusion, observation = (one.with_tables(tables) for one in programs)
+        return replace(self, inputs=inputs, conclusion=conclusion, observation=observation)
+
+
+def counted(graph: Graph) -> Store:
+    """Count a step, but none of an environment that starts an episode instead."""
+    is_fresh, count = _row(graph, "ended", _FLAG), _row(graph, "step_count", _COUNT)
+    none, more = Value.of(graph, 0).cast(_COUNT), (count + 1).cast(_COUNT)
+    return Store(graph.choose(is_fresh.node, none.node, more.node), ("step_count", 0))
+
+
+def ended(terminated: Value, truncated: Value, reward: Value, limit: int) -> list[Store]:
+    """Store the results of a step, and which episodes have ended.
+
+    An environment that has started an episode instead of a step has no reward and no end.
+
+    Args:
+        terminated: Where tasks have ended.
+        truncated: Where they are cut.
+        reward: The rewards.
+        limit: The steps after which an episode is truncated, too.
+    """
+    graph = terminated.graph
+    is_fresh = _row(graph, "ended", _FLAG)
+    has_stepped: Value = np.logical_not(is_fresh)
+    if limit < sys.maxsize:
+        truncated = truncated | (_row(graph, "step_count", _COUNT) >= limit)
+    terminated, truncated = terminated & has_stepped, truncated & has_stepped
+    results = {
+        "reward": where(is_fresh, 0.0, reward),
+        "terminated": terminated,
+        "truncated": truncated,
+        "done": terminated,
+        "ended": terminated | truncated,
+    }
+    return [Store(value.node, (kind, 0)) for kind, value in results.items()]
+
+
+def seen_stores(number: int, values: Sequence[Value]) -> list[Store]:
+    """Store the elements of an array of observations or infos, which has this number."""
+    letter, count = letter_of(values[0].dtype), len(values)
+    return [
+        Store(value.node, ("seen", number, place, count, TYPES.index(letter)))
+        for place, value in enumerate(values)
+    ]
+
+
+def _row(graph: Graph, kind: str, dtype: np.dtype[Any]) -> Value:
+    return Value(graph, graph.load("row", (kind, 0), dtype))
 
 
 def to_input_type(variable: Variable, value: Value) -> Value:
