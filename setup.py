@@ -21,7 +21,7 @@ native = Extension(
         str(path)
         for folder in (".", "python", "worker")
         for path in Path("native", folder).glob("*.c")
-        if path.name != "main.c"  # of the worker program, which fmugym.wine builds
+        if path.name != "main.c"  # of the worker program, which fmugym.fmi.wine builds
     ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
     include_dirs=["native", np.get_include()],

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from gymnasium.vector.utils import batch_space
 
 import fmugym
-from fmugym.pool.native import NativePool
-from fmugym.task.interface import resolve
+from fmugym.environment.interface import resolve
+from fmugym.pool.native_pool import NativePool
 
 __all__ = [
     "BuildingByHand",

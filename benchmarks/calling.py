@@ -6,9 +6,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from fmugym.env import FMUEnv
-from fmugym.task.hooks import Hooks
-from fmugym.task.step import ORDER
+from fmugym.environment.env import FMUEnv
+from fmugym.environment.hooks import ORDER, Hooks
 
 __all__ = ["ARRAYS", "EACH", "EXPRESSIONS", "in_python", "in_way"]
 

@@ -61,7 +61,9 @@ def _vector(effort: Effort) -> list[Table]:
     sizes = SIZES[:2] if effort.quick else SIZES
     title = "Processor time of a call of step on one thread in us"
     table = Table(title, ["environments", *map(str, sizes)])
-    logging.getLogger("fmugym.vector").setLevel(logging.ERROR)  # it warns of hooks one by one
+    logging.getLogger("fmugym.environment.vector").setLevel(
+        logging.ERROR
+    )  # it warns of hooks one by one
     cells = [_times_of_ways(size, effort) for size in sizes]
     table.rows = [[name, *(cell[name] for cell in cells)] for name in cells[0]]
     return [table]

@@ -22,7 +22,7 @@ from tables import Table, rate, times
 
 from fmugym import FMU
 from fmugym.pool import PoolSpec
-from fmugym.pool.native import NativePool
+from fmugym.pool.native_pool import NativePool
 
 __all__ = ["tables"]
 

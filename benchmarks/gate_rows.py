@@ -264,8 +264,7 @@ def _rollouts(size: int, stack: ExitStack) -> Workload:
 def _pool(size: int, stack: ExitStack) -> Workload:
     """A pool of cart-poles; its makers are no public face, so this function changes with them."""
     from fmugym.pool import PoolSpec
-    from fmugym.trial.opening import open_pool
-    from fmugym.trial.pool_options import PoolOptions
+    from fmugym.pool.opening import PoolOptions, open_pool
 
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     outputs = tuple(map(fmu.variable, ("x", "x_dot", "phi", "phi_dot")))

@@ -21,8 +21,8 @@ from measure import Effort, MissingError
 from tables import Table, duration, share
 
 import fmugym
+from fmugym.environment.vector.env_maker import make_with_pool
 from fmugym.envs import CartPoleEnv
-from fmugym.vector.env_maker import make_with_pool
 
 __all__ = ["tables"]
 

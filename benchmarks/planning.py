@@ -15,11 +15,11 @@ from tables import Table, duration
 from training import Goal, train, write_plants
 
 import fmugym
-from fmugym.baselines import MPC, controller_of
+from fmugym.control import MPC, controller_of
 from fmugym.envs.house import HOUSE_TASK
-from fmugym.episodes.evaluation import HELD_OUT_SEED, Score, evaluate
-from fmugym.episodes.simulation import Player, policy_of_controller
-from fmugym.series.intervals import confidence
+from fmugym.records.episode_statistics import confidence
+from fmugym.records.evaluation import HELD_OUT_SEED, Score, evaluate
+from fmugym.records.players import Player, policy_of_controller
 from fmugym.training.agents import agent_player
 
 __all__ = ["tables"]

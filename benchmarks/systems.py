@@ -19,10 +19,17 @@ from measure import Effort, MissingError, Run, Sample, Stopwatch, by_turns, rati
 from tables import Table, rate, times
 
 from fmugym import FMU, bundled_fmu
+from fmugym.fmi.systems.system import SystemFMU
+from fmugym.fmi.systems.system_plan import (
+    MASTERS,
+    ComponentPlan,
+    Evaluation,
+    Group,
+    Link,
+    SystemPlan,
+)
 from fmugym.pool import Pool, PoolSpec
-from fmugym.pool.native import NativePool
-from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import MASTERS, ComponentPlan, Evaluation, Group, Link, SystemPlan
+from fmugym.pool.native_pool import NativePool
 
 __all__ = ["tables"]
 

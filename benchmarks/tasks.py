@@ -29,9 +29,9 @@ from measure import Effort, MissingError, Run, by_turns, make_runs, repeated
 from tables import Table, duration, times
 
 import fmugym
+from fmugym.environment.interface import resolve
+from fmugym.environment.vector.task_programs import compile_formulas, formulas_of
 from fmugym.expressions.program import OPERATIONS, is_function
-from fmugym.task.interface import resolve
-from fmugym.vector.hooks.formula_programs import compile_formulas, formulas_of
 
 __all__ = ["TASKS", "Task", "fmugym_run", "tables"]
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 import fmugym
-from fmugym.baselines import MPC
+from fmugym.control import MPC
 
 Array = npt.NDArray[np.float64]
 

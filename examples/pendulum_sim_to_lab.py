@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
 import fmugym
+from fmugym.control.linearization import LinearModel, linearize
 from fmugym.lab import CellType, Client, Lab, ManualClock
-from fmugym.linearization import LinearModel, linearize
 
 ENV = "fmugym/CloudPendulum-v0"
 PERIOD = 0.02  # s, from one sample to the next

@@ -19,7 +19,7 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-from fmugym.rllib import register_task
+from fmugym.training.rllib import register_task
 
 ENVS, BATCH, GOAL = 16, 2048, 475.0
 RETURN = "episode_return_mean"

@@ -18,7 +18,7 @@ import numpy as np
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
-from fmugym.baselines import Controller
+from fmugym.control import Controller
 from fmugym.envs.house import HOUSE_TASK
 
 PLANT = '''

@@ -6,16 +6,23 @@ Everything else is imported when it is first used.
 
 from typing import TYPE_CHECKING
 
-from fmugym.lazy import lazily
+from fmugym.extras import lazily
 from fmugym.registration import register, register_bundled
 
 if TYPE_CHECKING:
     from fmugym import envs
-    from fmugym.archive.bundled import bundled_fmu
-    from fmugym.archive.fmu import FMU
-    from fmugym.declared import Task, TaskEnv, load
-    from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-    from fmugym.env import FMI1CSEnv, FMI1MEEnv, FMI2CSEnv, FMI2MEEnv, FMI3CSEnv, FMI3MEEnv, FMUEnv
+    from fmugym.environment.distributions import Choice, LogUniform, Normal, Uniform
+    from fmugym.environment.env import (
+        FMI1CSEnv,
+        FMI1MEEnv,
+        FMI2CSEnv,
+        FMI2MEEnv,
+        FMI3CSEnv,
+        FMI3MEEnv,
+        FMUEnv,
+    )
+    from fmugym.environment.snapshots import Snapshot
+    from fmugym.environment.vector import FMUVectorEnv
     from fmugym.errors import (
         ConfigError,
         ContractError,
@@ -25,9 +32,9 @@ if TYPE_CHECKING:
         SimulationError,
         TaskError,
     )
-    from fmugym.systems import Component, Connection, FMUSystem
-    from fmugym.task.snapshot import Snapshot
-    from fmugym.vector import FMUVectorEnv
+    from fmugym.fmi import FMU, bundled_fmu
+    from fmugym.fmi.systems import Component, Connection, FMUSystem
+    from fmugym.task import Task, TaskEnv, load
 
 __all__ = [
     "FMU",
@@ -63,27 +70,25 @@ __all__ = [
 ]
 
 _MODULES = {
-    "archive.bundled": ["bundled_fmu"],
-    "archive.fmu": ["FMU"],
-    "declared": ["Task", "TaskEnv", "load"],
-    "distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
-    "env": [
+    "environment.distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
+    "environment.env": [
         *("FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"),
         *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
     ],
+    "environment.snapshots": ["Snapshot"],
+    "environment.vector": ["FMUVectorEnv"],
     "errors": [
         *("ConfigError", "ContractError", "FMUGymError"),
         *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),
     ],
-    "systems": ["Component", "Connection", "FMUSystem"],
-    "task.snapshot": ["Snapshot"],
-    "vector": ["FMUVectorEnv"],
+    "fmi.bundled": ["bundled_fmu"],
+    "fmi.fmu": ["FMU"],
+    "fmi.systems": ["Component", "Connection", "FMUSystem"],
+    "task": ["Task", "TaskEnv", "load"],
 }
 _ROOMS = [
-    *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),
-    *("errors", "fmi", "identification", "lab", "linearization", "pool", "recording"),
-    *("registration", "rendering", "sb3", "systems", "task", "testing", "tools", "trial"),
-    "vector",
+    *("checks", "cli", "control", "deployment", "environment", "envs", "errors", "fmi", "lab"),
+    *("pool", "records", "registration", "rendering", "task", "training"),
 ]
 """Modules and packages that ``fmugym.name`` imports."""
 

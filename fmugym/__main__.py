@@ -1,10 +1,10 @@
-"""``python -m fmugym`` and the program ``fmugym``: the command line of ``fmugym.tools.cli``."""
+"""``python -m fmugym`` and the program ``fmugym``: ``fmugym.cli.command_line``."""
 
 from __future__ import annotations
 
 import sys
 
-from fmugym.tools.signal_handling import end_as_after_ctrl_c, exit_code
+from fmugym.cli.signals import end_as_after_ctrl_c, exit_code
 
 __all__ = ["main"]
 
@@ -18,9 +18,9 @@ def main() -> int:
     try:
         end_as_after_ctrl_c()
         sys.path.append("")  # module:Class may be in the working directory
-        from fmugym.tools import cli
+        from fmugym.cli import command_line
 
-        return cli.run_command_line()
+        return command_line.run_command_line()
     except KeyboardInterrupt as error:
         return exit_code(error)
 

@@ -1,4 +1,4 @@
-"""Pools of FMU instances in C; ``fmugym.pool.native`` is the way to use them.
+"""Pools of FMU instances in C; ``fmugym.pool.native_pool`` is the way to use them.
 
 Arrays may be anything with a buffer: float64 for values, bool for masks, float32 for observations,
 int8 for statuses. Those that are only read may have any strides.
@@ -18,7 +18,7 @@ def operations() -> tuple[str, ...]:
     """The operations of programs, in the order of their numbers."""
 
 Program = tuple[bytes, tuple[Array, ...]]
-"""The form of a program, and its rows; see ``Program.with_rows`` of ``fmugym.vector.hooks``."""
+"""The form of a program, and its rows: ``Program.with_rows`` of ``fmugym.environment.vector``."""
 
 def evaluate(
     program: Program,
@@ -98,7 +98,7 @@ class Access:
     """A list of variables of one FMI version.
 
     Args:
-        form: See ``fmugym.pool.form.form_of_listing``.
+        form: See ``fmugym.pool.pool_form.form_of_listing``.
 
     Raises:
         ValueError: If the form is damaged.
@@ -111,7 +111,7 @@ class Draws:
     """The draws of an episode.
 
     Args:
-        form: See ``fmugym.pool.form.form_of_draws``.
+        form: See ``fmugym.pool.pool_form.form_of_draws``.
         standard_normal: The address of numpy's ``random_standard_normal``, or 0.
         exponential: The address of the function ``exp`` behind ``math.exp``, or 0.
 
@@ -150,7 +150,7 @@ class Pool:
     whose work is done by then. The next call reports the other messages.
 
     Args:
-        form: See ``fmugym.pool.form.form_of_pool``.
+        form: See ``fmugym.pool.pool_form.form_of_pool``.
         arrays: The pool's own: inputs, outputs, statuses, observations, and the counts of
             ``fmugym.pool.health``, int64.
         callback: Receives the number of an instance, the status, the category and the text of each
@@ -208,7 +208,7 @@ class Pool:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
     def play(self, actions: Array, at_ends: bool, /) -> tuple[Any, ...]:
-        """Do a step, with all that was taken over; see ``Play.step`` of ``fmugym.pool.base``.
+        """Do a step, with all that was taken over; see ``Play.step`` of ``fmugym.pool.pool``.
 
         Raises:
             TypeError: If the actions have another type or shape than was prepared.
@@ -234,7 +234,7 @@ class Pool:
         """
 
     def reset_by(self, options: Any, /) -> tuple[Any, ...] | None:
-        """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
+        """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.pool``."""
 
     def count_steps(self) -> None:
         """Add the steps so far to the counts."""
@@ -242,7 +242,7 @@ class Pool:
     def ask(
         self, request: int, content: bytes, states: Sequence[bytes] = ..., /
     ) -> tuple[int, Any]:
-        """Ask for something else; see ``fmugym.pool.requests``.
+        """Ask for something else; see ``fmugym.pool.engine``.
 
         Args:
             request: What for.

@@ -1,16 +1,41 @@
-"""Optional libraries of extras, imported when they are used; and a compiler for C."""
+"""Imports on demand: names of packages, and optional libraries of extras; a compiler for C, too."""
 
 from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, Final
 
 from fmugym.errors import ConfigError
 
-__all__ = ["c_compiler", "imported", "installation", "lacking"]
+__all__ = ["c_compiler", "imported", "installation", "lacking", "lazily"]
+
+
+def lazily(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """Make the ``__getattr__`` of a package (PEP 562).
+
+    Args:
+        package: Its name.
+        modules: The module of each name; of a module of the package, its own.
+
+    Returns:
+        A function that imports a name, keeps it in the package and returns it. It raises an
+        ``AttributeError`` for other names.
+    """
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module = import_module(modules[name])
+        value = module if modules[name] == f"{package}.{name}" else getattr(module, name)
+        setattr(sys.modules[package], name, value)
+        return value
+
+    return get
+
 
 _COMPILERS: Final = ("cc", "gcc", "clang")
 

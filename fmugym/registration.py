@@ -10,9 +10,9 @@ from typing import Any, cast
 import gymnasium
 
 from fmugym.checks import check_text
+from fmugym.environment.vector import vectorized
+from fmugym.environment.vector.entry_points import vector_entry_point
 from fmugym.errors import ConfigError, shown
-from fmugym.vector import vectorized
-from fmugym.vector.entry_points import vector_entry_point
 
 __all__ = ["register", "register_bundled"]
 
@@ -72,7 +72,7 @@ def register_bundled() -> None:
     """Register the environments that come with the package, without importing them."""
     for name, spec in _BUNDLED.items():
         register(f"fmugym/{name}-v0", f"fmugym.envs:{name}Env", **spec)
-    register("fmugym/FMU-v0", "fmugym.declared:load")
+    register("fmugym/FMU-v0", "fmugym.task:load")
 
 
 def _entry_point(env: Any) -> Any:

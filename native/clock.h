@@ -9,7 +9,7 @@
 
 struct Solver;
 
-/* FMI's interval variabilities; the last one has two kinds here. fmugym/archive/variable.py lists
+/* FMI's interval variabilities; the last one has two kinds here. fmugym/fmi/variable.py lists
  * their names in this order. */
 typedef enum {
     CLOCK_CONSTANT,

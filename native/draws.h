@@ -1,4 +1,4 @@
-/* Drawing from distributions as fmugym/distributions.py does with a generator of numpy: the same
+/* Drawing from distributions as fmugym/environment/distributions.py does with a generator of numpy: the same
  * numbers of the stream make the same values, to the last bit. */
 
 #ifndef FMUGYM_DRAWS_H

@@ -21,7 +21,7 @@ typedef enum {
     STATUS_NOT_FINITE = 7  /* an output is NaN or infinite */
 } Status;
 
-/* The C types of values. fmugym/pool/form.py uses the same numbers. FMI 1.0 and 2.0 have only
+/* The C types of values. fmugym/pool/pool_form.py uses the same numbers. FMI 1.0 and 2.0 have only
  * FLOAT64 (Real), INT32 (Integer), BOOLEAN and STRING. The functions get and set of Fmi do not take
  * STRING. */
 typedef enum {
@@ -178,7 +178,7 @@ typedef struct Fmi {
     void (*drop)(const Library *library, void *component);
 } Fmi;
 
-/* How an FMU is run. fmugym/pool/form.py has the same numbers. */
+/* How an FMU is run. fmugym/pool/pool_form.py has the same numbers. */
 typedef enum {
     CO_SIMULATION_ALONE,
     MODEL_EXCHANGE_SOLVED,

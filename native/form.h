@@ -3,7 +3,7 @@
  * A form is a row of numbers of 8 bytes: integers, flags and doubles. A block has its size before it,
  * and zeros after it up to the next multiple of 8. A text is a block that ends with a zero. So every
  * number lies at an address that is a multiple of its size, and nothing has to be copied out of a
- * form. fmugym/pool/form.py writes forms.
+ * form. fmugym/pool/pool_form.py writes forms.
  *
  * Anyone may have written the bytes: what does not fit is refused. */
 
@@ -12,7 +12,7 @@
 
 #include "access.h"
 
-enum { FORM_VERSION = 1 }; /* fmugym/pool/form.py has the same number */
+enum { FORM_VERSION = 1 }; /* fmugym/pool/pool_form.py has the same number */
 
 /* Reads a form from memory that is aligned to 8 bytes. What is missing reads as 0, and after that
  * nothing can be read any more. */

@@ -1,4 +1,4 @@
-/* The form of a pool: its settings, and the FMU or the system. fmugym/pool/form.py writes it. */
+/* The form of a pool: its settings, and the FMU or the system. fmugym/pool/pool_form.py writes it. */
 
 #ifndef FMUGYM_POOL_FORM_H
 #define FMUGYM_POOL_FORM_H

@@ -1,4 +1,4 @@
-/* The forms of programs, and of the draws of an episode. fmugym/pool/form.py writes them. */
+/* The forms of programs, and of the draws of an episode. fmugym/pool/pool_form.py writes them. */
 
 #ifndef FMUGYM_PROGRAM_FORM_H
 #define FMUGYM_PROGRAM_FORM_H

@@ -1,5 +1,5 @@
 /* Requests: what the owner of a pool asks of it besides its steps, as forms. The owner is in this process,
- * or has a worker in another one. fmugym/pool/requests.py writes requests and reads answers. */
+ * or has a worker in another one. fmugym/pool/engine.py writes requests and reads answers. */
 
 #ifndef FMUGYM_REQUESTS_H
 #define FMUGYM_REQUESTS_H
@@ -8,7 +8,7 @@
 #include "states.h"
 #include "writer.h"
 
-/* In the order of fmugym/pool/requests.py. Each of them has one answer. */
+/* In the order of fmugym/pool/engine.py. Each of them has one answer. */
 typedef enum {
     REQUEST_OPEN,
     REQUEST_STEP,

@@ -13,7 +13,7 @@ typedef enum {
     KIND_RECORD /* the record of the episode, see recorded_inputs.h */
 } StateKind;
 
-/* fmugym/pool/bundle.py has the same. */
+/* fmugym/pool/states.py has the same. */
 typedef struct {
     int64_t kind;
     int64_t steps; /* communication steps */

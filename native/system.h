@@ -16,7 +16,7 @@ typedef struct {
     const char *text;
 } PartString;
 
-/* How a part begins an episode, from the fastest way to the surest. fmugym/pool/form.py has the
+/* How a part begins an episode, from the fastest way to the surest. fmugym/pool/pool_form.py has the
  * same numbers. */
 typedef enum {
     METHOD_RESTORE,  /* returns to its state after the initialization, if start values are the same */

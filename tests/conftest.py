@@ -18,10 +18,10 @@ import wine_tools
 from ways import in_python, many
 
 import fmugym
+from fmugym.cli.command_line import run_command_line
 from fmugym.errors import ConfigError
+from fmugym.fmi.wine import Wine
 from fmugym.pool.extension import require_engine
-from fmugym.tools.cli import run_command_line
-from fmugym.wine.prefix import Wine
 
 sys.path += [folder for folder in building.FOLDERS if folder not in sys.path]
 

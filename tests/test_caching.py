@@ -10,10 +10,10 @@ import pytest
 from process_tools import run_python
 
 import fmugym
-from fmugym.caching import cache_folder, lasting_folder, own_prefix, sweep
 from fmugym.envs import CartPoleEnv
-from fmugym.trial.known import recall, remember
-from fmugym.wine.windows_worker import wine_folder
+from fmugym.files import cache_folder, lasting_folder, own_prefix, sweep
+from fmugym.fmi.wine import wine_folder
+from fmugym.pool.trial.verdict import recall, remember
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Windows has no such owners and modes")
 
@@ -84,7 +84,7 @@ class TestCache:
 
 KILLED = """
 import os, signal
-from fmugym.trial.known import remember
+from fmugym.pool.trial.verdict import remember
 os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
 remember("key", "text")
 """

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.declared.writing import write_new
-from fmugym.episodes import output_files
-from fmugym.episodes.evaluation import Score, plot_scores
+from fmugym.cli import episode_commands
 from fmugym.files import replaced, replaced_together, write_whole
-from fmugym.tools import playing
-from fmugym.training import agents, checkpoints, outcome, training_records
-from fmugym.training.searching import Searching
+from fmugym.records import output_files
+from fmugym.records.evaluation import Score, plot_scores
+from fmugym.task.task_writer import write_new
+from fmugym.training import agents, checkpoints, training_records, training_report
+from fmugym.training.search_training import Searching
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
 
@@ -156,8 +156,8 @@ def test_the_curve_and_its_picture(tmp_path):
     pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
     for steps in (1, 2):
         training_records.append_row(tmp_path, ("steps", "reward"), (steps, 0.5))
-    assert outcome.write_curve(tmp_path, "title", print) is not None
-    unchanged(tmp_path, lambda: outcome.write_curve(tmp_path, "another", print))
+    assert training_report.write_curve(tmp_path, "title", print) is not None
+    unchanged(tmp_path, lambda: training_report.write_curve(tmp_path, "another", print))
     unchanged(tmp_path, lambda: training_records.append_row(tmp_path, (), ("x" * ROOM, 0.5)))
     training_records.append_row(tmp_path, ("steps", "reward"), (3, 0.5))
     assert (tmp_path / "evaluations.csv").read_text() == "steps,reward\n1,0.5\n2,0.5\n3,0.5\n"
@@ -173,10 +173,10 @@ def test_pictures_of_scores(tmp_path):
 def test_a_recording(tmp_path):
     write_whole(tmp_path / "episode.npz", SMALL)
     recording = SimpleNamespace(
-        **dict.fromkeys(fmugym.recording._ARRAYS, np.random.default_rng(0).random(2000))
+        **dict.fromkeys(fmugym.records.recording._ARRAYS, np.random.default_rng(0).random(2000))
     )
-    vars(recording).update(dict.fromkeys(fmugym.recording.METADATA))
-    save = fmugym.recording.Recording.save
+    vars(recording).update(dict.fromkeys(fmugym.records.recording.METADATA))
+    save = fmugym.records.recording.Recording.save
     unchanged(tmp_path, lambda: save(recording, tmp_path / "episode.npz"))
 
 
@@ -243,9 +243,10 @@ def test_force_brings_the_old_file_back(command, task, tmp_path, cli, monkeypatc
     arguments = command, task, "--episodes", "1", option, picture
     assert cli(*arguments)[0] == 0
     before = contents(picture.parent)
-    owner, name = {"evaluate": (playing, "plot_scores"), "simulate": (output_files, "_draw")}[
-        command
-    ]
+    owner, name = {
+        "evaluate": (episode_commands, "plot_scores"),
+        "simulate": (output_files, "_draw"),
+    }[command]
     full_within(monkeypatch, owner, name)
     code, _, err = cli(*arguments, "--force")
     assert (code, "large" in err) == (1, True)

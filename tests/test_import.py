@@ -4,13 +4,20 @@ import pytest
 from process_tools import run_python
 
 import fmugym
-from fmugym import vector
+from fmugym.environment import vector
 
-HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.vector_env", "fmugym.envs")
+HEAVY = (
+    "fmpy",
+    "pygame",
+    "fmugym.environment.env",
+    "fmugym.pool",
+    "fmugym.environment.vector.vector_env",
+    "fmugym.envs",
+)
 
 OPTIONAL = (
-    *("lab", "identification", "series", "search", "systems.ssp", "sb3", "rllib"),
-    *("pettingzoo", "export", "logs", "minari", "episodes", "repair", "training", "tools"),
+    *("cli", "control.identification", "deployment", "fmi.systems.ssp_archive"),
+    *("fmi.source_compiler", "fmi.stand_in", "lab", "records", "training"),
 )
 
 
@@ -26,8 +33,8 @@ def test_importing_the_package_imports_little():
 def test_a_class_brings_neither_vector_environments_nor_pictures():
     program = "import sys, fmugym; fmugym.FMI2CSEnv; print(*(m for m in sys.modules))"
     imported = set(run(program))
-    assert "fmugym.env" in imported
-    assert not {"pygame", "fmugym.vector.vector_env", "fmugym.lab"} & imported
+    assert "fmugym.environment.env" in imported
+    assert not {"pygame", "fmugym.environment.vector.vector_env", "fmugym.lab"} & imported
 
 
 def test_environments_work_without_optional_rooms():
@@ -56,10 +63,10 @@ def test_every_public_name_is_there():
         assert getattr(fmugym, name) is not None
         assert name in dir(fmugym)
     program = "from fmugym import *; print(CartPole := envs.CartPoleEnv, FMUVectorEnv, register)"
-    assert "fmugym.vector.vector_env.FMUVectorEnv" in " ".join(run(program))
+    assert "fmugym.environment.vector.vector_env.FMUVectorEnv" in " ".join(run(program))
 
 
-@pytest.mark.parametrize("name", ["lab", "testing", "identification", "rendering", "vector"])
+@pytest.mark.parametrize("name", ["lab", "environment", "control", "rendering", "records"])
 def test_rooms_are_imported_by_name(name):
     assert run(f"import fmugym; print(fmugym.{name}.__name__)") == [f"fmugym.{name}"]
 
@@ -73,10 +80,14 @@ def test_other_names_are_refused(module):
 
 @pytest.mark.parametrize(
     ("module", "library"),
-    [("sb3", "stable_baselines3"), ("minari", "minari"), ("rllib", "ray")],
+    [
+        ("training.sb3", "stable_baselines3"),
+        ("records.minari", "minari"),
+        ("training.rllib", "ray"),
+    ],
 )
 def test_a_missing_library_names_its_extra(module, library):
     program = f"import sys; sys.modules[{library!r}] = None; import fmugym.{module}"
     done = run_python("-c", program)
     assert done.returncode == 1
-    assert f"pip install '.[{module}]'" in done.stderr
+    assert f"pip install '.[{module.rpartition('.')[2]}]'" in done.stderr

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import fmugym
-from fmugym.config import EnvConfig
+from fmugym.environment.config import EnvConfig
 
 ROOT = Path(__file__).parent.parent
 
@@ -47,7 +47,7 @@ def test_a_new_task_names_the_schema_beside_it(tmp_path, monkeypatch, ran):
     first, *_ = Path("task.toml").read_text().splitlines()
     schema = Path(first.removeprefix("#:schema "))
     assert not schema.is_absolute()
-    assert schema.read_text() == (ROOT / "fmugym/declared/task.schema.json").read_text()
+    assert schema.read_text() == (ROOT / "fmugym/task/task.schema.json").read_text()
     task = fmugym.Task.read("task.toml")
     Path("other").mkdir()
     task.write("copy.toml")

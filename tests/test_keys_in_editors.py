@@ -45,7 +45,7 @@ def taplo(tmp_path_factory):
 
 def check(taplo, folder, *texts):
     """Check files with these texts: the exit code, and all that is said."""
-    shutil.copy(ROOT / "fmugym/declared/task.schema.json", folder / "fmugym.schema.json")
+    shutil.copy(ROOT / "fmugym/task/task.schema.json", folder / "fmugym.schema.json")
     for number, text in enumerate(texts):
         (folder / f"{number}.toml").write_text(f"#:schema ./fmugym.schema.json\n{text}")
     command = [taplo, "check", "--colors", "never", *(f"{n}.toml" for n in range(len(texts)))]

@@ -10,7 +10,7 @@ import gymnasium
 
 import fmugym
 from fmugym import FMUEnv, FMUVectorEnv, TaskEnv
-from fmugym.task.hooks import Hooks
+from fmugym.environment.hooks import Hooks
 
 PACKAGE = Path(fmugym.__file__).parent
 
@@ -36,12 +36,9 @@ def layers_on(line):
 
 
 LAYERS, CORE = picture()
-EXCEPTIONS = {
-    "fmugym.systems.system": "fmugym.systems.ssp.archives",
-    "fmugym.baselines.mpc": "fmugym.search.excitation",
-}
-"""Where the core opens an optional package: ``FMUSystem.read``, of archives that need it, and
-``MPC``, whose surrogate comes from an FMU that a controller excites: functions import these."""
+EXCEPTIONS = {"fmugym.control.mpc": "fmugym.training.search.excitation"}
+"""Where the core opens an optional package, in a function: the surrogate of ``MPC`` comes from an FMU
+that a controller excites."""
 
 
 def module_of(path):
@@ -77,8 +74,7 @@ def imported_by(node):
 
 
 def package_of(module):
-    parts = module.split(".")[1:] or ["__init__"]
-    return "systems/ssp" if parts[:2] == ["systems", "ssp"] else parts[0]
+    return (module.split(".")[1:] or ["__init__"])[0]
 
 
 def test_the_picture_has_each_package_once():
@@ -122,7 +118,7 @@ def test_no_module_imports_itself_by_a_detour():
 
 
 FOLDERS = ("fmugym", "examples", "benchmarks", "tests")
-ENVIRONMENT = {"env", "task", "vector"}
+ENVIRONMENT = {"environment"}
 """The rooms of the environment."""
 
 ENVIRONMENTS = {cls for env in (TaskEnv, FMUEnv, FMUVectorEnv) for cls in env.__mro__}

@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform
-from fmugym.config import FOREIGN, EnvConfig
+from fmugym.environment.config import FOREIGN, EnvConfig
 
 TYPES = [
     int,

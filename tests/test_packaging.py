@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from versions import versions
 
-from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS
+from fmugym.fmi.bundled import BUNDLED_FMUS, FMI_VERSIONS
 
 ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(

@@ -9,9 +9,9 @@ import re
 from pathlib import Path
 from typing import Any
 
-from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.config import CONFIG, FOREIGN
-from fmugym.declared import format as task_format
+from fmugym.environment.config import CONFIG, FOREIGN
+from fmugym.fmi.safe_zip import ArchiveLimits
+from fmugym.fmi.systems.components import Component
 from fmugym.keys import (
     REQUIRED,
     AnyKind,
@@ -23,10 +23,10 @@ from fmugym.keys import (
     Table,
     table_of_fields,
 )
-from fmugym.systems.components import Component
+from fmugym.task import task_keys as task_format
 
 DOCS = Path(__file__).resolve().parents[1]
-SCHEMA = DOCS.parent / "fmugym" / "declared" / "task.schema.json"
+SCHEMA = DOCS.parent / "fmugym" / "task" / "task.schema.json"
 """The schema, which comes with the package."""
 
 VARIABLE = task_format.VARIABLE.keys

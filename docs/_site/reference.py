@@ -16,7 +16,7 @@ PAGES: Final = {
         "FMI2CSEnv",
         "FMI3CSEnv",
         *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
-        "config.EnvConfig",
+        "environment.config.EnvConfig",
         "register",
     ),
     "Many environments": ("FMUVectorEnv",),
@@ -24,7 +24,7 @@ PAGES: Final = {
     "Distributions": ("Uniform", "Normal", "LogUniform", "Choice"),
     "Thinking ahead": ("Snapshot",),
     "Agents": ("training.agents.load_agent",),
-    "FMUs": ("FMU", "archive.ArchiveLimits", "fmi.Status", "bundled_fmu"),
+    "FMUs": ("FMU", "fmi.ArchiveLimits", "fmi.Status", "bundled_fmu"),
     "Systems": ("FMUSystem", "Component", "Connection"),
     "Rigs": ("pool.Backend", "pool.Paced"),
     "Errors": (),  # and all other exceptions
@@ -32,18 +32,18 @@ PAGES: Final = {
 """Names in ``fmugym``, and others by their modules in it."""
 
 MODULES: Final = {
-    "Recordings": "fmugym.recording",
-    "Linear models": "fmugym.linearization",
-    "Baselines": "fmugym.baselines",
-    "Stable-Baselines3": "fmugym.sb3",
-    "PettingZoo": "fmugym.pettingzoo",
-    "RLlib": "fmugym.rllib",
-    "Plant logs": "fmugym.logs",
-    "Fits to plant logs": "fmugym.fit",
-    "Minari": "fmugym.minari",
-    "Export": "fmugym.export",
-    "Checks of an environment": "fmugym.testing",
-    "Identification": "fmugym.identification",
+    "Recordings": "fmugym.records.recording",
+    "Linear models": "fmugym.control.linearization",
+    "Baselines": "fmugym.control",
+    "Stable-Baselines3": "fmugym.training.sb3",
+    "PettingZoo": "fmugym.training.pettingzoo",
+    "RLlib": "fmugym.training.rllib",
+    "Plant logs": "fmugym.records.plant_log",
+    "Fits to plant logs": "fmugym.records.log_fit",
+    "Minari": "fmugym.records.minari",
+    "Export": "fmugym.deployment.export",
+    "Checks of an environment": "fmugym.environment.testing",
+    "Identification": "fmugym.control.identification",
     "Pictures": "fmugym.rendering",
 }
 

@@ -20,7 +20,7 @@ from typing import Final
 
 from PIL import Image
 
-from fmugym.tools.cli import run_command_line
+from fmugym.cli.command_line import run_command_line
 
 IMAGES: Final = Path(__file__).parent.parent / "images"
 

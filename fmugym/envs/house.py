@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from fmugym.declared import Task, TaskEnv
+from fmugym.task import Task, TaskEnv
 
 __all__ = ["HOUSE_TASK", "HouseEnv"]
 

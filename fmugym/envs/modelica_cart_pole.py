@@ -10,10 +10,10 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive.bundled import bundled_fmu
 from fmugym.checks import check_number
-from fmugym.env import FMI1CSEnv, FMI2CSEnv, FMUEnv
+from fmugym.environment.env import FMI1CSEnv, FMI2CSEnv, FMUEnv
 from fmugym.envs.task_numbers import TaskNumber
+from fmugym.fmi.bundled import bundled_fmu
 from fmugym.rendering import CartPoleFrame, CartPoleScene
 
 __all__ = ["DymolaCSCartPoleEnv", "JModelicaCSCartPoleEnv", "ModelicaCartPoleEnv"]

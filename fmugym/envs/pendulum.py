@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive.bundled import bundled_fmu
-from fmugym.distributions import Uniform
-from fmugym.env import FMUEnv
+from fmugym.environment.distributions import Uniform
+from fmugym.environment.env import FMUEnv
 from fmugym.envs.task_numbers import TaskNumber, largest, with_task_numbers
+from fmugym.fmi.bundled import bundled_fmu
 from fmugym.rendering import PendulumFrame, PendulumScene
 
 __all__ = ["PendulumEnv"]

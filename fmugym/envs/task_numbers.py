@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Never
 
 from fmugym.checks import check_mapping
-from fmugym.distributions import is_distribution, support_of
+from fmugym.environment.distributions import is_distribution, support_of
 from fmugym.errors import ConfigError
 
 __all__ = ["TaskNumber", "largest", "with_task_numbers"]

@@ -2,11 +2,11 @@
 
 The grammar is a part of Python's: numbers, names, ``+ - * / % **``, comparisons, ``and``, ``or``,
 ``not``, ``a if condition else b``, and calls of functions, see ``FUNCTIONS`` in
-``fmugym.expressions.mathematics``. ``previous(x)`` is the value of ``x`` before the step. A name
+``fmugym.expressions.functions``. ``previous(x)`` is the value of ``x`` before the step. A name
 may have dots and indices, as those of an FMU do: ``zone[1].T``. There are no texts or assignments.
 Each value is a number or a condition; in arithmetic a condition counts as 0 or 1.
 
-An expression becomes nodes of a graph, see ``fmugym.expressions.value``. Its only names are those
+An expression becomes nodes of a graph, see ``fmugym.expressions.graph``. Its only names are those
 that the caller gives. It works element by element, so that it serves one environment and arrays of
 them.
 """
@@ -27,9 +27,8 @@ import numpy as np
 
 from fmugym.checks import float_or_nan
 from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
-from fmugym.expressions.graph import Graph
-from fmugym.expressions.mathematics import FUNCTIONS
-from fmugym.expressions.value import Value, where
+from fmugym.expressions.functions import FUNCTIONS
+from fmugym.expressions.graph import Graph, Value, where
 
 __all__ = ["CONSTANTS", "Expression", "Names"]
 

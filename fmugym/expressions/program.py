@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.extension import require_engine
-from fmugym.pool.form import form_of_program
+from fmugym.pool.pool_form import form_of_program
 
 __all__ = [
     "LETTERS",

@@ -19,7 +19,7 @@ from fmugym.lab.client import Client
 from fmugym.lab.data import CellType, LabError, UserInfo
 from fmugym.lab.lab import Lab, current_lab
 from fmugym.lab.lab_options import Options
-from fmugym.pool.backend.clocks import Clock, ManualClock, RealClock
+from fmugym.pool.rig.clocks import Clock, ManualClock, RealClock
 
 __all__ = [
     "CellType",

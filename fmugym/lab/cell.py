@@ -1,4 +1,8 @@
-"""A cell: an FMU instance with its drive and its sensors."""
+"""Cell: an FMU instance with its drive and its sensors.
+
+The drive is impedance control of each joint, with limited torque. The sensors are quantized,
+filtered and noisy, with a new sample every 2 ms.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +15,153 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.bundled import bundled_fmu
-from fmugym.archive.fmu import FMU
-from fmugym.archive.variable import checked_value
 from fmugym.checks import check_mapping
+from fmugym.environment.fmu_variables import start_variable
 from fmugym.errors import ConfigError, SimulationError
+from fmugym.fmi.bundled import bundled_fmu
+from fmugym.fmi.fmu import FMU
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.lab.data import CellType, LabError
-from fmugym.lab.drive import HOLD_DAMPING, Drive
-from fmugym.lab.experiments import EXPERIMENTS, PLANTS
+from fmugym.fmi.variable import checked_value
+from fmugym.lab.data import EXPERIMENTS, PLANTS, CellType, LabError
 from fmugym.lab.lab_options import Options
-from fmugym.lab.sensors import Sensors
 from fmugym.pool import Pool, PoolSpec
-from fmugym.task.starting import start_variable
-from fmugym.trial.opening import open_pool
+from fmugym.pool.opening import open_pool
 
-__all__ = ["Cell", "checked_parameters"]
+__all__ = ["HOLD_DAMPING", "Cell", "Drive", "Sensors", "checked_parameters"]
+
+HOLD_DAMPING: Final = 0.03
+"""Damping of the controller that holds an arm, in N m s/rad; about critical for the single
+pendulum."""
+
+
+class Drive:
+    """The control law tau = kp (q* - q) + kd (qd* - qd) + tau_ff for each joint.
+
+    The hardware evaluates it at 40 kHz; this drive evaluates it once in ``Options.drive_step``.
+    A spring torque that is constant over a step would pump energy into the joint, like a damping
+    of -kp step / 2. The law therefore uses the angle that the present velocity gives for the
+    middle of the step.
+
+    Args:
+        options: The limits and the step.
+        driven: Whether each joint has torque.
+
+    Attributes:
+        position: q* of each joint, in rad.
+        velocity: qd* of each joint, in rad/s.
+        torque: tau_ff of each joint, in N m.
+        kp: Stiffness of each joint, in N m/rad.
+        kd: Damping of each joint, in N m s/rad.
+    """
+
+    def __init__(self, options: Options, driven: Sequence[bool]) -> None:
+        zeros = [0.0] * len(driven)
+        self.position, self.velocity, self.torque = zeros[:], zeros[:], zeros[:]
+        self.kp, self.kd = zeros[:], zeros[:]
+        self._limits = [options.torque_limit if is_driven else 0.0 for is_driven in driven]
+        self._ahead = 0.5 * options.drive_step
+
+    def evaluate(self, position: Sequence[float], velocity: Sequence[float]) -> list[float]:
+        """Return the torque of each joint over the next step, in N m.
+
+        Args:
+            position: True angles, in rad.
+            velocity: True angular velocities, in rad/s.
+        """
+        ahead = self._ahead
+        return [
+            min(
+                max(kp * (aim - q - v * ahead) + kd * (rate - v) + feed, -limit),
+                limit,
+            )
+            for q, v, kp, aim, kd, rate, feed, limit in zip(
+                position,
+                velocity,
+                self.kp,
+                self.position,
+                self.kd,
+                self.velocity,
+                self.torque,
+                self._limits,
+                strict=True,
+            )
+        ]
+
+
+_BLOCK = 64  # rows of random numbers drawn at once, as single draws are slow
+
+
+class Sensors:
+    """The sensors of one cell.
+
+    Args:
+        options: The imperfections of the sensors.
+        joints: The number of joints.
+        rng: The random generator of the noise.
+
+    Attributes:
+        sample: The newest readings, a number for each joint: ``"position"`` in rad,
+            ``"velocity"`` in rad/s and ``"torque"`` in N m. They stay until the next sample.
+    """
+
+    def __init__(self, options: Options, joints: int, rng: np.random.Generator) -> None:
+        self._options, self._joints, self._rng = options, joints, rng
+        self._step = options.drive_step
+        self._period = max(1, round(options.sample_period / self._step))
+        lag = options.velocity_lag
+        self._gain = 1.0 if lag == 0.0 else -math.expm1(-self._step / lag)
+        self._noise: list[list[float]] = []
+        self.sample: dict[str, list[float]] = {}
+
+    def restart(self, position: Sequence[float]) -> None:
+        """Begin a session with joints at rest, at positions in rad."""
+        self._filtered = [0.0] * self._joints
+        self._count = 0
+        self._take(position, [0.0] * self._joints)
+
+    def observe(
+        self, position: Sequence[float], velocity: Sequence[float], torque: Sequence[float]
+    ) -> None:
+        """Update the filter after one step of the drive, and take a sample if one is due.
+
+        Args:
+            position: True angles, in rad.
+            velocity: True angular velocities, in rad/s.
+            torque: True torques of the motors, in N m.
+        """
+        gain = self._gain
+        self._filtered = [f + gain * (v - f) for f, v in zip(self._filtered, velocity, strict=True)]
+        self._count += 1
+        if self._count >= self._due:
+            self._take(position, torque)
+
+    def _take(self, position: Sequence[float], torque: Sequence[float]) -> None:
+        options, (of_velocity, of_torque, early) = self._options, self._draw()
+        sigmas = options.velocity_noise[: self._joints]
+        velocities = zip(self._filtered, sigmas, of_velocity, strict=True)
+        torques = zip(torque, of_torque, strict=True)
+        self.sample = {
+            "position": list(map(_quantized, position, options.encoder_step)),
+            "velocity": [v + sigma * x for v, sigma, x in velocities],
+            "torque": [tau + options.torque_noise * x for tau, x in torques],
+        }
+        is_early = self._period > 1 and early < options.early_sample_share
+        self._due = self._count + (self._period // 2 if is_early else self._period)
+
+    def _draw(self) -> tuple[list[float], list[float], float]:
+        """Return normal numbers for velocity and torque, and a uniform one from 0 to 1."""
+        n = self._joints
+        if not self._noise:
+            normal = self._rng.standard_normal((_BLOCK, 2 * n))
+            uniform = self._rng.random((_BLOCK, 1))
+            self._noise = np.concatenate([normal, uniform], axis=1).tolist()
+        row = self._noise.pop()
+        return row[:n], row[n : 2 * n], row[-1]
+
+
+def _quantized(position: float, step: float) -> float:
+    return step * round(position / step) if step else position
+
 
 logger = logging.getLogger(__name__)
 

@@ -1,15 +1,28 @@
-"""Data of the client's methods, and the error that they raise."""
+"""Experiments: their types, and the FMUs that simulate the cells; data of the client's methods.
+
+``LabError`` is the error that these methods raise.
+"""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Final
 
 from fmugym.errors import FMUGymError
 
-__all__ = ["CellType", "LabError", "UserInfo", "as_lab_error"]
+__all__ = [
+    "EXPERIMENTS",
+    "PLANTS",
+    "CellType",
+    "Experiment",
+    "JointPlant",
+    "LabError",
+    "UserInfo",
+    "as_lab_error",
+]
 
 
 class CellType(enum.Enum):
@@ -63,3 +76,89 @@ def as_lab_error() -> Iterator[None]:
         raise
     except FMUGymError as error:
         raise LabError(str(error)) from None
+
+
+_UNLIMITED_TORQUE: Final = 10.0  # N m; the lab's drive limits the torque, before disturbances
+_UNLIMITED_VELOCITY: Final = 1000.0  # rad/s; the lab ends a session at a lower velocity
+
+
+@dataclass(frozen=True)
+class JointPlant:
+    """An FMU and the names of its variables, joint by joint.
+
+    Attributes:
+        model: The name of the bundled FMU.
+        torques: Inputs, in N m.
+        positions: Outputs, in rad, 0 hanging.
+        velocities: Outputs, in rad/s.
+        start_positions: Parameters, in rad.
+        parameters: Values of further parameters by name.
+        coulomb_friction: The parameter that ``Options.coulomb_friction`` sets, or None.
+        joint_names: The names of the joints.
+    """
+
+    model: str
+    torques: tuple[str, ...]
+    positions: tuple[str, ...]
+    velocities: tuple[str, ...]
+    start_positions: tuple[str, ...]
+    parameters: Mapping[str, float]
+    coulomb_friction: str | None
+    joint_names: tuple[str, ...]
+
+    @property
+    def joints(self) -> int:
+        """The number of joints."""
+        return len(self.torques)
+
+
+PLANTS: Final = {
+    CellType.SINGLE: JointPlant(
+        model="Pendulum",
+        torques=("tau",),
+        positions=("q",),
+        velocities=("q_dot",),
+        start_positions=("q_0",),
+        parameters={"tau_max": _UNLIMITED_TORQUE, "theta_dot_max": _UNLIMITED_VELOCITY, "g": 9.81},
+        coulomb_friction="c",
+        joint_names=("pivot",),
+    ),
+    CellType.DOUBLE: JointPlant(
+        model="DoublePendulum",
+        torques=("tau1", "tau2"),
+        positions=("q1", "q2"),
+        velocities=("q1_dot", "q2_dot"),
+        start_positions=("q1_0", "q2_0"),
+        parameters={
+            "tau_max1": _UNLIMITED_TORQUE,
+            "tau_max2": _UNLIMITED_TORQUE,
+            "q_dot_max": _UNLIMITED_VELOCITY,
+        },
+        coulomb_friction=None,
+        joint_names=("shoulder", "elbow"),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A type of experiment.
+
+    Attributes:
+        cell_type: The type of cell that it needs.
+        driven: Whether each joint has torque.
+        parameters: Values of the plant's parameters that it changes.
+    """
+
+    cell_type: CellType
+    driven: tuple[bool, ...]
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+EXPERIMENTS: Final = {
+    "DoubleIntegrator": Experiment(CellType.SINGLE, (True,), {"g": 0.0}),
+    "SimplePendulum": Experiment(CellType.SINGLE, (True,)),
+    "DoublePendulum": Experiment(CellType.DOUBLE, (True, True)),
+    "Acrobot": Experiment(CellType.DOUBLE, (False, True)),
+    "Pendubot": Experiment(CellType.DOUBLE, (True, False)),
+}

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.fmi.status import Status
-from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
+from fmugym.pool.pool import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
 __all__ = [

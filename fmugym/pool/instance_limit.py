@@ -12,8 +12,8 @@ import weakref
 from dataclasses import dataclass
 from typing import Final
 
-from fmugym.archive.fmu import FMU
 from fmugym.errors import LicenceError
+from fmugym.fmi.fmu import FMU
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["claim_instances"]

@@ -1,29 +1,71 @@
-"""Licences of FMUs: wait for one, or raise an error that quotes the FMU."""
+"""Licences of FMUs: wait for one, or raise an error that quotes the FMU.
+
+Resets of demanding FMUs are repeated while licences are refused. Messages tell the progress of
+calls that may take minutes.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import re
+import threading
 import time
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final, TypeVar
 
 import numpy as np
 
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import MaskArray, Pool
-from fmugym.pool.bundle import IndexArray
+from fmugym.fmi.variable import Variable
+from fmugym.pool.health import CountedPool
+from fmugym.pool.pool import FloatArray, MaskArray, Pool, StatusArray
+from fmugym.pool.states import IndexArray
 
 __all__ = [
+    "RetryingPool",
     "licence_errors",
+    "progress",
     "refusals",
     "require_licence",
     "require_started",
     "speaks_of_licence",
     "wait_for_licence",
 ]
+
+_EVERY: Final = 10.0
+"""Seconds between two messages."""
+
+
+@contextmanager
+def progress(log: logging.Logger, call: str) -> Iterator[None]:
+    """Log the duration of a call in this context every ten seconds, at INFO.
+
+    Args:
+        log: The logger.
+        call: What takes so long: the FMU and the call.
+    """
+    if not log.isEnabledFor(logging.INFO):
+        yield
+        return
+    over = threading.Event()
+    thread = threading.Thread(target=_tell, args=[log, call, over], daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def _tell(log: logging.Logger, call: str, over: threading.Event) -> None:
+    start = time.monotonic()
+    while not over.wait(_EVERY):
+        log.info("%s has taken %.0f s so far", call, time.monotonic() - start)
+
 
 R = TypeVar("R")
 
@@ -136,3 +178,75 @@ def _advice(seconds: float) -> str:
     if seconds:
         return f"no licence came within {seconds:g} s (licence_wait)"
     return "'licence_wait' of the table 'foreign' gives the seconds to wait for a licence"
+
+
+class RetryingPool(CountedPool):
+    """A pool whose resets may be tried again while licences are refused."""
+
+    _patience: tuple[str, logging.Logger] | None = None
+    """The FMU's name, and a logger that is told what takes long; None if resets are done once."""
+
+    _release: Callable[[], None] | None = None
+
+    @property
+    def retries_resets(self) -> bool:
+        """See ``Pool.retries_resets``."""
+        return self._patience is not None
+
+    def hold(self, release: Callable[[], None]) -> None:
+        """Keep the claim of the instances until ``close``, which releases it."""
+        self._release = release
+
+    def _release_claim(self) -> None:
+        if self._release is not None:
+            self._release()
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``."""
+        if self._patience is None:
+            self._reset_some(variables, values, mask)
+        else:
+            self._reset_patiently(*self._patience, variables, values, mask)
+        return self.outputs, self.statuses
+
+    def _reset_some(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> None:
+        """Reset instances; those that have failed without files of the FMU are reset with them."""
+        if self._spec.makes_anew:
+            self.extract()
+        if self._reset_once(variables, values, mask) and self.extract():
+            failed = self._as_mask(mask) & (self.statuses > WARNING_CODE)
+            self._reset_once(variables, values, failed)
+
+    @abstractmethod
+    def _reset_once(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
+    ) -> int:
+        """Reset once; return the number of troubled instances."""
+
+    def _reset_patiently(
+        self,
+        name: str,
+        log: logging.Logger,
+        variables: tuple[Variable, ...],
+        values: FloatArray,
+        mask: MaskArray | None,
+    ) -> None:
+        """Reset instances; those that get no licence are reset again."""
+        chosen = self._as_mask(mask)
+        what = f"{name}: the initialization of {np.count_nonzero(chosen)} instance(s)"
+
+        def attempt() -> None:
+            nonlocal chosen
+            with progress(log, what):
+                self._reset_some(variables, values, chosen)
+            refused = refusals(self, chosen)
+            if refused:
+                chosen = np.isin(np.arange(self.num_instances), list(refused))
+                raise LicenceError(next(iter(refused.values())))
+
+        with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
+            wait_for_licence(self._spec.licence_wait, log, attempt)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.form import Writer
+from fmugym.pool.pool_form import Writer
 
 __all__ = ["ArrayElement", "RowStart", "Rows", "form_of_play"]
 

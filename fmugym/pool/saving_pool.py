@@ -1,4 +1,7 @@
-"""Pools that save the states of single instances, and restore them in any others."""
+"""Pools that save the states of single instances, and restore them in any others.
+
+Recorded inputs of an episode may be in its saved state.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,23 @@ import itertools
 import logging
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import FMU
-from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
+from fmugym.fmi.description import ModelDescription
+from fmugym.fmi.fmu import FMU
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import FloatArray, MaskArray, StatusArray
-from fmugym.pool.bundle import (
+from fmugym.fmi.variable import Variable, with_texts
+from fmugym.pool.licences import RetryingPool
+from fmugym.pool.pool import FloatArray, MaskArray, StatusArray
+from fmugym.pool.pool_form import START_TIME_TYPE, table_of, type_number
+from fmugym.pool.spec import START_TIME, PoolSpec, ResetMethod
+from fmugym.pool.states import (
     Bundle,
     Copies,
     IndexArray,
@@ -26,11 +34,89 @@ from fmugym.pool.bundle import (
     head_of,
     outputs_of,
 )
-from fmugym.pool.recorded_inputs import RecordedInputs, inputs_in
-from fmugym.pool.retrying import RetryingPool
-from fmugym.pool.spec import PoolSpec, ResetMethod
 
-__all__ = ["SavingPool", "keeps_records", "offered_method"]
+__all__ = ["RecordedInputs", "SavingPool", "inputs_in", "keeps_records", "offered_method"]
+
+
+def _variables_of(
+    description: ModelDescription,
+    types: Sequence[int],
+    references: Sequence[int],
+    places: Sequence[int],
+    texts: Iterable[str],
+) -> tuple[Variable, ...]:
+    """Find start variables by C type, value reference and place in an array.
+
+    Aliases are as good. A String knows the text that it got.
+    """
+    version = table_of(description)
+    known = {
+        (type_number(one, version), one.value_reference): one
+        for v in description.variables.values()
+        if v.is_number or v.kind == "string"
+        for one in (v.elements if v.driven is not None else (v,))
+    }
+    known[START_TIME_TYPE, START_TIME.value_reference] = START_TIME
+    found = [
+        known[type_, reference].elements[place]
+        for type_, reference, place in zip(types, references, places, strict=True)
+    ]
+    left = [*texts]
+    return tuple(
+        with_texts(variable, [left.pop(0)]) if variable.kind == "string" else variable
+        for variable in found
+    )
+
+
+_START: Final = np.dtype(
+    [("value", "f8"), *((name, "u4") for name in ("type", "reference", "place", "size"))]
+)
+"""A start value among recorded inputs; ``RecordedStart`` of ``native/pool.h``."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedInputs:
+    """Record of the inputs of an instance in its episode until it was saved.
+
+    Attributes:
+        variables: Those that were set before initialization.
+        starts: Their values, shape (P,).
+        inputs: The inputs of each step, shape (steps, k_in).
+    """
+
+    variables: tuple[Variable, ...]
+    starts: FloatArray
+    inputs: FloatArray
+
+
+def inputs_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> RecordedInputs:
+    """Read the recorded inputs in a state that has some.
+
+    Args:
+        description: That of the FMU.
+        spec: That of the pool.
+        state: The state. That of a worker may be anything.
+
+    Raises:
+        SimulationError: If it has none of this FMU.
+    """
+    try:
+        return _inputs_in(description, spec, state)
+    except (KeyError, IndexError, ValueError):
+        raise SimulationError("the recorded inputs of an episode are damaged") from None
+
+
+def _inputs_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> RecordedInputs:
+    head, (_, content) = head_of(state), outputs_of(state, len(spec.outputs))
+    end = head.starts * _START.itemsize
+    starts = np.frombuffer(content[:end], _START)
+    types, references, places = (starts[n].tolist() for n in ("type", "reference", "place"))
+    after = end + int(starts["size"].sum())
+    texts = content[end:after].decode().split("\0")[:-1]
+    inputs = np.frombuffer(content[after:]).reshape(head.rows, len(spec.inputs))
+    variables = _variables_of(description, types, references, places, texts)
+    return RecordedInputs(variables, starts["value"], inputs)
+
 
 logger = logging.getLogger(__name__)
 

@@ -8,8 +8,8 @@ from enum import StrEnum
 from functools import cached_property
 from typing import Final
 
-from fmugym.archive.description import ModelDescription
-from fmugym.archive.variable import Variable
+from fmugym.fmi.description import ModelDescription
+from fmugym.fmi.variable import Variable
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",

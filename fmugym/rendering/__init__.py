@@ -16,8 +16,7 @@ A `Renderer` draws the frames of a scene into a window (`render_mode="human"`) o
 
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas, Color, Point, World
-from fmugym.rendering.overlay import Overlay
-from fmugym.rendering.renderer import Renderer, Scene
+from fmugym.rendering.renderer import Overlay, Renderer, Scene
 from fmugym.rendering.scenes import CartPoleFrame, CartPoleScene, PendulumFrame, PendulumScene
 
 __all__ = [

@@ -1,17 +1,164 @@
-"""The renderer: draws the frames of a scene into a window or into arrays."""
+"""Renderer: draws the frames of a scene into a window or into arrays, with an overlay.
 
-from typing import Final, Generic, Protocol, TypeVar
+All renderers of a process share the window of pygame. The overlay has the figures of a step, in a
+row at the top of a picture.
+"""
+
+import logging
+from dataclasses import dataclass
+from typing import ClassVar, Final, Generic, Protocol, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fmugym.checks import check_number, check_option, check_text, has_method
+from fmugym.checks import check_number, check_option, check_text, has_method, number_of
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering._pygame import pygame
 from fmugym.rendering.canvas import Canvas, World, checked_size
-from fmugym.rendering.overlay import Overlay
-from fmugym.rendering.window import Window
+
+_NONE: Final = "\N{EN DASH}"
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """Figures in the upper left corner of a picture: names, and values below them.
+
+    Args:
+        time: Time of the episode, in s.
+        action: The action as text with its unit, such as "+10.0 N"; "" before the first step.
+        reward: Reward of the last step; None before the first step.
+        episode_return: Sum of the rewards of the episode; None before the first step.
+
+    Raises:
+        ConfigError: If an argument has a wrong type.
+    """
+
+    time: float
+    action: str = ""
+    reward: float | None = None
+    episode_return: float | None = None
+
+    def __post_init__(self) -> None:
+        check_text("the action of an overlay", self.action)
+        for name in ("time", "reward", "episode_return"):
+            value = getattr(self, name)
+            if value is not None or name == "time":
+                object.__setattr__(self, name, number_of(f"{name} of an overlay", value))
+
+    def draw(self, canvas: Canvas) -> None:
+        """Write the figures, in a size that follows the width of the picture."""
+        unit = canvas.size[0] / 500.0
+        for column, (name, value) in enumerate(self._figures()):
+            x = round(unit * (18 + 118 * column))
+            canvas.caption((x, round(unit * 15)), name, round(unit * 18), palette.MUTED)
+            canvas.caption((x, round(unit * 30)), value, round(unit * 26), palette.INK)
+
+    def _figures(self) -> tuple[tuple[str, str], ...]:
+        return (
+            ("time", f"{_number(self.time)} s"),
+            ("reward", _number(self.reward)),
+            ("return", _number(self.episode_return)),
+            ("action", self.action or _NONE),
+        )
+
+
+def _number(value: float | None) -> str:
+    """Return two decimals, or a power of ten for a number too long for its column."""
+    if value is None:
+        return _NONE
+    return f"{value:.3e}" if abs(value) >= 1e7 else f"{value:.2f}"
+
+
+logger = logging.getLogger(__name__)
+_KEYS: Final = (pygame.KEYDOWN, pygame.KEYUP)
+_HIGHEST_RATE: Final = 1000.0  # pygame counts in ms
+
+
+class Window:
+    """A share in the one window that pygame has per process.
+
+    Shares of different sizes resize the window in turn. The first picture opens the display, and
+    the last share closes it, unless another program part had opened it. If the user closes the
+    window, it closes for all shares, and they do not show further pictures.
+
+    Args:
+        size: Width and height, in pixels.
+        title: Title of the window.
+    """
+
+    _shares: ClassVar[WeakSet["Window"]] = WeakSet()
+    _is_display_ours: ClassVar[bool] = False
+
+    def __init__(self, size: tuple[int, int], title: str) -> None:
+        self._size = size
+        self._title = title
+        self._clock = pygame.time.Clock()
+        self.is_closed = False
+
+    def show(self, picture: pygame.Surface, fps: float) -> None:
+        """Show a picture, and wait to keep the rate of pictures.
+
+        Args:
+            picture: A picture of the window's size.
+            fps: Largest number of pictures per second.
+
+        Raises:
+            ConfigError: If there is no display.
+        """
+        surface = self._open()
+        if _is_quit_requested():
+            self._dismiss()
+            return
+        surface.blit(picture, (0, 0))
+        pygame.display.flip()
+        self._clock.tick(min(fps, _HIGHEST_RATE))
+
+    def close(self) -> None:
+        """Give up the share; a second call does nothing."""
+        self.is_closed = True
+        if self in Window._shares:
+            Window._shares.remove(self)
+            Window._close_unused_display()
+
+    def _open(self) -> pygame.Surface:
+        Window._shares.add(self)
+        try:
+            return self._surface()
+        except pygame.error as error:
+            Window._shares.discard(self)
+            Window._close_unused_display()
+            raise ConfigError(
+                f'render_mode="human" needs a display ({error}); use render_mode="rgb_array"'
+            ) from error
+
+    def _surface(self) -> pygame.Surface:
+        if not pygame.display.get_init():
+            pygame.display.init()
+            Window._is_display_ours = True
+        surface = pygame.display.get_surface()
+        if surface is None or surface.get_size() != self._size:
+            surface = pygame.display.set_mode(self._size)
+            pygame.display.set_caption(self._title.replace("\0", ""))
+        return surface
+
+    def _dismiss(self) -> None:
+        logger.warning("The window was closed; the environment continues without it.")
+        for share in tuple(Window._shares):
+            share.close()
+
+    @classmethod
+    def _close_unused_display(cls) -> None:
+        if cls._is_display_ours and not cls._shares:
+            cls._is_display_ours = False
+            pygame.display.quit()
+
+
+def _is_quit_requested() -> bool:
+    """Empty the event queue, but keep the keys: a program may steer an environment by them."""
+    return any(event.type == pygame.QUIT for event in pygame.event.get(exclude=_KEYS))
+
 
 FrameT = TypeVar("FrameT")
 FrameT_contra = TypeVar("FrameT_contra", contravariant=True)

@@ -1,1 +1,6 @@
-"""Parts of an environment: the FMU's interface, spaces, values by name, and episodes."""
+"""Tasks that are declared in a file or a dict instead of a class; see ``docs/task-file.md``."""
+
+from fmugym.task.task_env import TaskEnv, load
+from fmugym.task.task_file import Task
+
+__all__ = ["Task", "TaskEnv", "load"]

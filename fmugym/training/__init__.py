@@ -1,1 +1,1 @@
-"""Trainings: by a search, and with the algorithms of Stable-Baselines3."""
+"""Training of agents: by a search for policies, with Stable-Baselines3, RLlib and others."""

@@ -15,17 +15,16 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.baselines import Controller
 from fmugym.checks import check_option, check_path, require_regular
-from fmugym.env import FMUEnv
-from fmugym.episodes.simulation import Player, Policy, policy_of_controller
+from fmugym.control import Controller
+from fmugym.environment.actions import are_scaled, unscaled
+from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError, reading_file, shown
 from fmugym.extras import imported
 from fmugym.files import replaced_together
-from fmugym.scaling import are_scaled, unscaled
-from fmugym.search.policy import POLICY_FILE, ResidualAgent, require_task
-from fmugym.search.residual import Residual
-from fmugym.training.residuals import residual_of
+from fmugym.records.players import Player, Policy, policy_of_controller
+from fmugym.training.residual import Residual, residual_of
+from fmugym.training.search.policy import POLICY_FILE, ResidualAgent, require_task
 
 __all__ = [
     "AGENT_FILE",
@@ -118,7 +117,7 @@ def agent_player(folder: Path) -> Player:
 
 
 class TrainedModel:
-    """An agent of Stable-Baselines3, with the methods of a ``fmugym.baselines.Controller``.
+    """An agent of Stable-Baselines3, with the methods of a ``fmugym.control.Controller``.
 
     Args:
         folder: Folder of the agent, for errors.

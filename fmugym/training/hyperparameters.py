@@ -13,7 +13,7 @@ from typing import Any, Final
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
 from fmugym.training.agents import algorithm_of
-from fmugym.training.training import TRIALS, TrainingSettings, Watch, require_new, train
+from fmugym.training.sb3_training import TRIALS, TrainingSettings, Watch, require_new, train
 from fmugym.training.training_records import append_row
 
 __all__ = ["tune_hyperparameters"]

@@ -1,7 +1,7 @@
 /* Messages between a worker and the process that has started it.
  *
  * A message is a head of two numbers, a code and a size, and a content of this size: a form, see
- * ../form.h. fmugym/pool/process/channel.py is the other end. */
+ * ../form.h. fmugym/pool/processes/channel.py is the other end. */
 
 #ifndef FMUGYM_FRAMES_H
 #define FMUGYM_FRAMES_H

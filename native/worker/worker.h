@@ -8,7 +8,7 @@
 #include "../requests.h"
 #include "frames.h"
 
-/* The arrays that the process shares with its parent; see fmugym/pool/process/shared_memory.py. They have
+/* The arrays that the process shares with its parent; see fmugym/pool/processes/shared_memory.py. They have
  * no gaps. */
 typedef struct {
     char *base;

@@ -21,9 +21,9 @@ from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
-from fmugym.tools.cli import _parser, run_command_line
-from fmugym.tools.options import EXAMPLES, speaking
+from fmugym.cli.command_line import _parser, run_command_line
+from fmugym.cli.options import EXAMPLES, speaking
+from fmugym.fmi.bundled import FMI_VERSIONS
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{1}}" description="{description}">
@@ -259,7 +259,7 @@ class TestSkeleton:
 
     def test_libraries_that_it_lacks_are_preloaded(self, ran, tmp_path, monkeypatch):
         name = "libgfortran.so.3"
-        monkeypatch.setattr("fmugym.tools.skeleton.replaceable", lambda fmu: (name,))
+        monkeypatch.setattr("fmugym.cli.class_skeleton.replaceable", lambda fmu: (name,))
         line = f'"foreign": {{"preload": ["./{name}"]}},'
         for is_there in (False, True):
             if is_there:
@@ -592,7 +592,7 @@ class TestCommand:
             ["info", str(path), "--json"],
             ["new", "--class", str(path)],
         ]
-        program = "from fmugym.tools.cli import run_command_line as run"
+        program = "from fmugym.cli.command_line import run_command_line as run"
         program = f"{program}\nassert not any(map(run, {commands}))"
         done = run_python("-c", program, environment={"PYTHONIOENCODING": "ascii:strict"})
         assert done.returncode == 0, done.stderr

@@ -18,11 +18,11 @@ from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
-from fmugym.declared import Task, load
-from fmugym.tools import advice as advice_tools
-from fmugym.tools.accuracy import Replay, substeps_of
-from fmugym.tools.findings import lines_of
-from fmugym.tools.validation import validate
+from fmugym.cli import advice as advice_tools
+from fmugym.cli.accuracy import Replay, substeps_of
+from fmugym.cli.advice import lines_of
+from fmugym.cli.validation import validate
+from fmugym.task import Task, load
 
 LAG = {
     "time_step": 0.05,

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines import controller_of
-from fmugym.episodes.simulation import policy_of, simulate
-from fmugym.tools import validation
-from fmugym.tools.validation import validate
+from fmugym.cli import validation
+from fmugym.cli.validation import validate
+from fmugym.control import controller_of
+from fmugym.records.players import policy_of, simulate
 
 TEXT = """
 fmu = {{ bundled = "Pendulum" }}

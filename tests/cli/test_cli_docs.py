@@ -11,7 +11,7 @@ import ssp_tools
 from source_tools import write_source_fmu
 
 import fmugym
-from fmugym.tools.cli import run_command_line
+from fmugym.cli.command_line import run_command_line
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "command-line.md").read_text()
@@ -22,7 +22,7 @@ BLOCKS = [
     for block in re.findall(
         r"^```bash\n(fmugym .*?)^```", (ROOT / "docs" / page).read_text(), re.M | re.S
     )
-    if "stand-in" not in block  # takes an old FMU; tests/repair/test_stand_in.py has one
+    if "stand-in" not in block  # takes an old FMU; tests/fmi/test_stand_in.py has one
 ]
 NEEDS = {
     "--algorithm": "stable_baselines3",
@@ -81,7 +81,7 @@ def test_every_command_has_an_example_or_a_link():
 
 
 def known_commands():
-    from fmugym.tools.cli import _parser
+    from fmugym.cli.command_line import _parser
 
     (action,) = (one for one in _parser()[0]._actions if one.dest == "==SUPPRESS==" or one.choices)
     return set(action.choices)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines import MPC
-from fmugym.baselines.candidate_evaluation import CandidateEvaluator
-from fmugym.baselines.table_texts import table_in
-from fmugym.search.policy import ResidualAgent
-from fmugym.tools import watching
-from fmugym.training import searching
-from fmugym.training.comparing import judge, verdict
+from fmugym.cli import options as watching
+from fmugym.control import MPC
+from fmugym.control.candidate_evaluation import CandidateEvaluator
+from fmugym.control.controller_table import table_in
+from fmugym.training import search_training
+from fmugym.training.search.policy import ResidualAgent
+from fmugym.training.search_training import judge, verdict
 
 PLANNER = "mpc horizon=0.2s candidates=18 rounds=2"
 ONE = {
@@ -112,13 +112,13 @@ class TestTrain:
                 return real(agent, evaluator, seeds)
             raise error("it has failed")
 
-        real, judged = ResidualAgent.play, searching.judge
+        real, judged = ResidualAgent.play, search_training.judge
 
         def judge(*arguments):
             monkeypatch.setattr(ResidualAgent, "play", play)
             return judged(*arguments)
 
-        monkeypatch.setattr(searching, "judge", judge)
+        monkeypatch.setattr(search_training, "judge", judge)
         document = {key: value for key, value in TWO.items() if key != "controllers"}
         output = "--output", tmp_path / "agent"
         task = written(document)

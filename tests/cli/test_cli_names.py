@@ -25,7 +25,7 @@ def completions(line, shell, file):
         "_ARGCOMPLETE_IFS": "\n",
         "_ARGCOMPLETE_STDOUT_FILENAME": str(file),
     }
-    program = "from fmugym.tools.cli import run_command_line; run_command_line()"
+    program = "from fmugym.cli.command_line import run_command_line; run_command_line()"
     run_python("-c", program, environment=settings, check=True)
     return [re.split(r"[:\t]", one)[0].strip() for one in file.read_text().splitlines()]
 

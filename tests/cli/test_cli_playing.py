@@ -14,10 +14,10 @@ from letters import wide
 
 import fmugym
 from fmugym import __main__ as program
-from fmugym.episodes.evaluation import Score, plot_scores
-from fmugym.series import TimeSeries
-from fmugym.tools import speed
-from fmugym.tools.cli import _parsed, _parser
+from fmugym.cli import episode_commands
+from fmugym.cli.command_line import _parsed, _parser
+from fmugym.records import TimeSeries
+from fmugym.records.evaluation import Score, plot_scores
 
 CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
 PID = "pid of=T setpoint=21 kp=0.3 ti=7200"
@@ -178,7 +178,7 @@ class TestBench:
             "reward": "-abs(q)",
             "time_step": 0.05,
         }
-        *_, report = speed.bench(lambda: fmugym.load(pendulum), [4], 0.05)
+        *_, report = episode_commands.bench(lambda: fmugym.load(pendulum), [4], 0.05)
         assert all(0 < one.fmu_share <= 1 for one in report.speeds)
         assert caplog.text == ""  # a pendulum without a mass would be an error
 
@@ -258,7 +258,7 @@ class TestInterruption:
         def interrupted(*_):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(speed, "_of_vector", interrupted)
+        monkeypatch.setattr(episode_commands, "_of_vector", interrupted)
         code, out, _ = cli("bench", CART_POLE, "--seconds", "0.01", "--json")
         assert (code, [one["envs"] for one in json.loads(out)["speeds"]]) == (130, [0])
 
@@ -267,8 +267,8 @@ class TestInterruption:
             raise KeyboardInterrupt
 
         monkeypatch.setattr(program, "end_as_after_ctrl_c", lambda: None)
-        monkeypatch.delitem(sys.modules, "fmugym.tools.cli")
-        monkeypatch.delattr("fmugym.tools.cli", raising=False)
+        monkeypatch.delitem(sys.modules, "fmugym.cli.command_line")
+        monkeypatch.delattr("fmugym.cli.command_line", raising=False)
         monkeypatch.setattr("builtins.__import__", interrupted)
         code = program.main()
         monkeypatch.undo()

@@ -10,15 +10,15 @@ from export_tools import closed_loop
 from test_residual import HIGH, TASK, TEXT, physical
 
 import fmugym
-from fmugym.baselines import controller_of
-from fmugym.export import agent_of
+from fmugym.control import controller_of
+from fmugym.deployment.export import agent_of
 from fmugym.training.agents import load_agent
 
 sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra 'sb3'")
 import torch  # noqa: E402  (comes with it)
 
-from fmugym.sb3 import ResidualActions, make_sb3_env  # noqa: E402
-from fmugym.search.residual import Residual  # noqa: E402
+from fmugym.training.residual import Residual  # noqa: E402
+from fmugym.training.sb3 import ResidualActions, make_sb3_env  # noqa: E402
 
 SAC = "--algorithm", "SAC", "learning_starts=10", "batch_size=16", "buffer_size=1000"
 pytestmark = pytest.mark.filterwarnings("ignore")  # those of the libraries

@@ -153,7 +153,7 @@ def test_signals_keep_the_agent_and_a_checkpoint(number, task, tmp_path, temp_ro
     folder = tmp_path / "agent"
     options = "--envs", "2", "--steps", "100000", "--episodes", "1", *ON_POLICY
     program = (
-        "import sys; from fmugym.training import training\n"
+        "import sys; from fmugym.training import sb3_training as training\n"
         "training._SECONDS_BETWEEN_CHECKPOINTS = 0.0\n"
         "from fmugym.__main__ import main; sys.exit(main())"
     )

@@ -17,13 +17,12 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines.candidate_evaluation import CandidateEvaluator
-from fmugym.search.policy import POLICY_FILE, ResidualAgent
-from fmugym.search.search import Search
-from fmugym.series.intervals import confidence
-from fmugym.tools.cli import run_command_line
-from fmugym.training.comparing import verdict
-from fmugym.training.searching import Searching
+from fmugym.cli.command_line import run_command_line
+from fmugym.control.candidate_evaluation import CandidateEvaluator
+from fmugym.records.episode_statistics import confidence
+from fmugym.training.search.policy import POLICY_FILE, ResidualAgent
+from fmugym.training.search.policy_search import Search
+from fmugym.training.search_training import Searching, verdict
 
 TASK = {
     "fmu": {"bundled": "Pendulum"},
@@ -381,7 +380,7 @@ class TestOutput:
         """There is a line every ten seconds, and in any case at the end; a round takes a second."""
         told = []
         clock = itertools.count()
-        monkeypatch.setattr("fmugym.tools.learning.monotonic", clock.__next__)
+        monkeypatch.setattr("fmugym.cli.training_commands.monotonic", clock.__next__)
         module = SimpleNamespace(tqdm=partial(Bar, told)) if has_tqdm else None
         monkeypatch.setitem(sys.modules, "tqdm", module)
         monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
@@ -434,7 +433,7 @@ class TestOutput:
         assert "warning" not in err
 
     def test_episodes_without_a_length_are_told(self, tmp_path, searched, monkeypatch):
-        monkeypatch.setattr("fmugym.search.probe.MOST_STEPS", 50)
+        monkeypatch.setattr("fmugym.training.search.probe.MOST_STEPS", 50)
         path = written(tmp_path, episode_length=None, controllers={"lazy": 0})
         _, _, err = searched(path, tmp_path / "a", "--rounds", "3")
         assert "no length" in err

@@ -15,18 +15,18 @@ from process_tools import faulty_fmu, start_values
 
 import fmugym
 from fmugym import __main__ as program
-from fmugym.baselines.candidate_evaluation import CandidateEvaluator
-from fmugym.search.probe import Probe
-from fmugym.search.search import Search
-from fmugym.tools import signal_handling
-from fmugym.training import outcome, searching
+from fmugym.cli import signals
+from fmugym.control.candidate_evaluation import CandidateEvaluator
+from fmugym.training import search_training, training_report
+from fmugym.training.search.policy_search import Search
+from fmugym.training.search.probe import Probe
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
 CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
 HANGING = """
 import sys
-from fmugym.tools import signal_handling
+from fmugym.cli import signals as signal_handling
 signal_handling._TIMEOUT = 0.5
 from fmugym.__main__ import main
 sys.exit(main())
@@ -124,18 +124,18 @@ MOMENTS = {
     "a look at the task": (Probe, "of", 1),
     "the first round": (Search, "advance", 1),
     "a later round": (Search, "advance", 30),
-    "writing an agent": (searching, "bytes_of", 1),
-    "writing a better one": (searching, "bytes_of", 3),
-    "the test": (searching, "judge", 1),
-    "the picture": (outcome, "draw_curve", 1),
+    "writing an agent": (search_training, "bytes_of", 1),
+    "writing a better one": (search_training, "bytes_of", 3),
+    "the test": (search_training, "judge", 1),
+    "the picture": (training_report, "draw_curve", 1),
 }
 
 
 @pytest.fixture(params=[signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def number(request, monkeypatch):
     """A signal that ends commands."""
-    monkeypatch.setattr(signal_handling, "_begun", threading.Event())
-    before = signal.signal(request.param, signal_handling._raise)
+    monkeypatch.setattr(signals, "_begun", threading.Event())
+    before = signal.signal(request.param, signals._raise)
     yield request.param
     signal.signal(request.param, before)
 
@@ -191,8 +191,8 @@ def test_while_modules_are_loaded(monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(program, "end_as_after_ctrl_c", signalled)
-    monkeypatch.setattr(signal_handling, "_begun", threading.Event())
-    before = signal.signal(signal.SIGTERM, signal_handling._raise)
+    monkeypatch.setattr(signals, "_begun", threading.Event())
+    before = signal.signal(signal.SIGTERM, signals._raise)
     try:
         assert program.main() == 143
     finally:

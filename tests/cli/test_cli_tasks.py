@@ -10,7 +10,7 @@ from fmu_tools import edited_fmu
 from plants import ONCE
 
 import fmugym
-from fmugym.tools.validation import validate
+from fmugym.cli.validation import validate
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

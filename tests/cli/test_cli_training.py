@@ -16,9 +16,9 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.episodes.evaluation import HELD_OUT_SEED, evaluate, warning_of_one_reward
-from fmugym.episodes.simulation import Player, action_of
-from fmugym.training.training import TrainingSettings, algorithm_arguments, train
+from fmugym.records.evaluation import HELD_OUT_SEED, evaluate, warning_of_one_reward
+from fmugym.records.players import Player, action_of
+from fmugym.training.sb3_training import TrainingSettings, algorithm_arguments, train
 
 CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
 SCENARIOS = {
@@ -78,7 +78,7 @@ def test_a_full_disk_is_told_with_the_folder(function, options, tmp_path, cli, m
     def fill(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(f"fmugym.tools.learning.{function}", fill)
+    monkeypatch.setattr(f"fmugym.cli.training_commands.{function}", fill)
     options = "--output", tmp_path / "agent", *options
     code, out, err = cli("train", CART_POLE, *options)
     assert (code, out) == (1, "")
@@ -133,7 +133,7 @@ def test_arguments_of_an_algorithm():
 
 
 def test_without_sb3_training_names_the_extra(tmp_path, trained, monkeypatch):
-    monkeypatch.setitem(sys.modules, "fmugym.sb3", None)
+    monkeypatch.setitem(sys.modules, "fmugym.training.sb3", None)
     code, out, err = trained(CART_POLE, "--output", tmp_path / "agent")
     assert (code, out) == (1, "")
     assert "pip install '.[sb3]'" in err
@@ -327,16 +327,19 @@ class TestTrain:
         self, tmp_path, cli, trained, monkeypatch, evaluations
     ):
         """The agent is kept, although it was never evaluated if there is a second Ctrl-C."""
-        from fmugym.training import training
+        from fmugym.training import sb3_training
 
-        original, calls = training.evaluate, iter([False] * 1 + [True] + [False] * 9 * evaluations)
+        original, calls = (
+            sb3_training.evaluate,
+            iter([False] * 1 + [True] + [False] * 9 * evaluations),
+        )
 
         def evaluate(*args, **kwargs):  # the second scenario of the first evaluation
             if next(calls, True):
                 raise KeyboardInterrupt
             return original(*args, **kwargs)
 
-        monkeypatch.setattr(training, "evaluate", evaluate)
+        monkeypatch.setattr(sb3_training, "evaluate", evaluate)
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         folder = tmp_path / "agent"
         options = "--output", folder, "--episodes", "1", "--envs", "2", "--steps", "400"

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 import fmugym
-from fmugym.baselines import PID
-from fmugym.baselines.parsing import search_of
-from fmugym.baselines.table_texts import table_in
+from fmugym.control import PID
+from fmugym.control.controller_parsing import search_of
+from fmugym.control.controller_table import table_in
 
 HOUSE = "fmugym/House-v0"
 RANGES = "pid of=T setpoint=20..22 kp=0.05..5 ti=14400"

@@ -11,8 +11,8 @@ from makers import MADE
 from test_cli import INPUT, OUTPUT, variable
 
 import fmugym
-from fmugym.archive.bundled import MODELS
-from fmugym.tools.proposal import Proposal
+from fmugym.cli.task_proposal import Proposal
+from fmugym.fmi.bundled import MODELS
 
 make_fmu = test_cli.make_fmu
 

@@ -18,8 +18,8 @@ from ways import in_way
 
 import fmugym
 import fmugym.lab
-from fmugym.task.hooks import Hooks
-from fmugym.trial.pool_options import PoolOptions
+from fmugym.environment.hooks import Hooks
+from fmugym.pool.opening import PoolOptions
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -16,8 +16,8 @@ pytest.importorskip("pymodbus", reason="needs pymodbus, of the extra plant")
 pytest.importorskip("scipy", reason="needs SciPy, of the extra identification")
 pytest.importorskip("matplotlib", reason="needs Matplotlib, of the extra plot")
 
-from fmugym.logs import PlantLog
-from fmugym.tools.cli import run_command_line
+from fmugym.cli.command_line import run_command_line
+from fmugym.records.plant_log import PlantLog
 
 TEXT = (Path(__file__).parents[2] / "docs" / "plant-tutorial.md").read_text(encoding="utf-8")
 REACHED = re.compile(r"seed \d+: reward (\S+), cost \S+ in (\d+) steps")

@@ -12,8 +12,8 @@ from pathlib import Path
 from PIL import Image
 
 import fmugym
+from fmugym.cli.command_line import run_command_line
 from fmugym.envs.house import HOUSE_TASK
-from fmugym.tools.cli import run_command_line
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "tutorial.md"
 TEXT = DOCUMENT.read_text(encoding="utf-8")

@@ -10,7 +10,7 @@ from combinations import in_turn
 from gymnasium.utils.env_checker import check_env
 
 import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
+from fmugym.fmi.bundled import FMI_VERSIONS
 
 _angles = np.random.default_rng(0).uniform(-10, 10, 100_000)
 SINES_AGREE = all(

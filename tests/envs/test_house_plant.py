@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from vector_tools import require_same_alone
 
 import fmugym
-from fmugym.baselines import PID, Hysteresis
+from fmugym.control import PID, Hysteresis
 from fmugym.envs.house import HOUSE_TASK, HouseEnv
 
 VERSIONS = ["2.0", "3.0"]

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
+from fmugym.fmi.bundled import FMI_VERSIONS
 
 
 class Plain(fmugym.FMUEnv):

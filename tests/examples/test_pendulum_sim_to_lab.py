@@ -7,7 +7,7 @@ from example_tools import EXAMPLES, run_example
 from PIL import Image
 
 import fmugym
-from fmugym.linearization import linearize
+from fmugym.control.linearization import linearize
 
 CELLS = {
     "heavy": {"plant": {"m": 0.085}},

@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fmugym.expressions.by_numpy import function_of
-from fmugym.expressions.graph import Graph
-from fmugym.expressions.value import Value
+from fmugym.expressions.graph import Graph, Value
+from fmugym.expressions.numpy_evaluation import function_of
 
 FORMULAS = {
     "negative": lambda x: -x,

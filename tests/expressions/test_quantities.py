@@ -9,8 +9,8 @@ import pytest
 from ways import ALL_WAYS, in_python, in_way
 
 import fmugym
-from fmugym.archive.bundled import bundled_fmu
 from fmugym.expressions.quantities import QUANTITIES
+from fmugym.fmi.bundled import bundled_fmu
 from fmugym.fmi.status import Status
 
 TASK = {
@@ -86,7 +86,7 @@ class Pushed(fmugym.FMI2CSEnv):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["theta", "theta_dot"],
-            "model_parameters": {"theta_0": fmugym.distributions.Uniform(-3.0, 3.0)},
+            "model_parameters": {"theta_0": fmugym.environment.distributions.Uniform(-3.0, 3.0)},
             "bounds": {"tau": (-2, 2)},
             "time_step": 0.05,
             "inputs": {"tau": "2 * action[0]"},

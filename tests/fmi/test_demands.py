@@ -5,10 +5,10 @@ from fmu_tools import PlainEnv, library_name, probe_config, probe_fmu, probe_lib
 
 import fmugym
 from fmugym import FMU
-from fmugym.fmi.words import as_messages, asked_for, quoted
-from fmugym.tools.cli import run_command_line
-from fmugym.tools.proposal import Proposal
-from fmugym.tools.skeleton import Skeleton
+from fmugym.cli.class_skeleton import Skeleton
+from fmugym.cli.command_line import run_command_line
+from fmugym.cli.task_proposal import Proposal
+from fmugym.pool.reports import as_messages, asked_for, quoted
 
 NEEDED = "!stop_defined", "a stop time is needed"
 

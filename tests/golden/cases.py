@@ -29,13 +29,13 @@ from pool_tools import sampled
 
 import fmugym
 from fmugym import FMU, FMUGymError
-from fmugym.archive.bundled import BUNDLED_FMUS, bundled_fmu
 from fmugym.envs.house import HOUSE_TASK
+from fmugym.fmi.bundled import BUNDLED_FMUS, bundled_fmu
+from fmugym.fmi.systems.system import SystemFMU
+from fmugym.fmi.systems.system_plan import MASTERS
 from fmugym.pool import PoolSpec
-from fmugym.pool.native import NativePool
+from fmugym.pool.native_pool import NativePool
 from fmugym.pool.spec import SOLVERS, START_TIME
-from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import MASTERS
 
 LOG = logging.getLogger("fmugym.test")
 ROOT = Path(__file__).parents[2]

@@ -32,8 +32,8 @@ from makers import by_python
 
 import fmugym
 from fmugym import Uniform
-from fmugym.export import agent_of, write_c, write_fmu, write_onnx
-from fmugym.tools.cli import run_command_line
+from fmugym.cli.command_line import run_command_line
+from fmugym.deployment.export import agent_of, write_c, write_fmu, write_onnx
 
 TASKS = Path(__file__).with_name("tasks")
 BUNDLED = ("CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum", "House")

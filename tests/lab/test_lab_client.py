@@ -25,7 +25,7 @@ class TestImports:
         assert issubclass(LabError, RuntimeError)
         assert issubclass(LabError, FMUGymError)
 
-    @pytest.mark.parametrize("room", ["lab", "identification", "rendering"])
+    @pytest.mark.parametrize("room", ["lab", "rendering"])
     def test_modules_of_a_room_form_no_circle(self, room):
         """Neither by imports at the top nor by imports in functions or for types."""
         folder = Path(fmugym.__file__).parent / room

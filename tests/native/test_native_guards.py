@@ -30,11 +30,11 @@ from fmugym.envs import CartPoleEnv
 from fmugym.expressions.program import CONSTANT, TYPES
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
-from fmugym.pool.native import NativePool
+from fmugym.pool.native_pool import NativePool
 from fmugym.pool.play_form import ArrayElement
-from fmugym.pool.recorded_inputs import inputs_in
+from fmugym.pool.pool_form import form_of_program, form_of_programs
+from fmugym.pool.saving_pool import inputs_in
 
 
 @pytest.fixture

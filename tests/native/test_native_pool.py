@@ -15,14 +15,13 @@ import pytest
 from plants import ONCE
 
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
-from fmugym.archive.bundled import BUNDLED_FMUS
 from fmugym.fmi import Status
+from fmugym.fmi.bundled import BUNDLED_FMUS
 from fmugym.pool import PoolSpec
-from fmugym.pool.native import NativePool
-from fmugym.trial.opening import open_pool
-from fmugym.trial.pool_options import PoolOptions
-from fmugym.trial.trial import compare
-from fmugym.trial.verdict import Neighbours
+from fmugym.pool.native_pool import NativePool
+from fmugym.pool.opening import PoolOptions, open_pool
+from fmugym.pool.trial.trial import compare
+from fmugym.pool.trial.verdict import Neighbours
 
 LOG = logging.getLogger("fmugym.test")
 on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -366,7 +365,7 @@ class TestIsolation:
         def full(*_, **options):
             raise OSError("no space left on device")
 
-        monkeypatch.setattr("fmugym.archive.fmu.shutil.copytree", full)
+        monkeypatch.setattr("fmugym.fmi.fmu.shutil.copytree", full)
         with pytest.raises(FMULoadError, match=r"needs a copy for each instance.*no space left"):
             native(shared, ["work"], ["total"], 3, private_libraries=True)
 

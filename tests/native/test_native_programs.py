@@ -7,7 +7,7 @@ import pytest
 from program_tools import code, constants
 
 from fmugym.expressions.program import TYPES
-from fmugym.pool.form import form_of_program
+from fmugym.pool.pool_form import form_of_program
 
 LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
 

@@ -24,9 +24,9 @@ from test_native_pool import busy_fmu, make
 from ways import in_way
 
 from fmugym import FMU, SimulationError
+from fmugym.environment.vector import FMUVectorEnv
 from fmugym.pool import PoolSpec
-from fmugym.pool.native import NativePool
-from fmugym.vector import FMUVectorEnv
+from fmugym.pool.native_pool import NativePool
 
 HERE = Path(__file__).parents[1]
 on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -367,7 +367,7 @@ import builtins, logging, random, signal, sys
 import numpy as np
 from fmugym import FMU
 from fmugym.pool import PoolSpec
-from fmugym.pool.native import NativePool
+from fmugym.pool.native_pool import NativePool
 
 error, count = getattr(builtins, sys.argv[2]), int(sys.argv[3])
 log = logging.Logger("signals")

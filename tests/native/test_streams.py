@@ -10,13 +10,13 @@ from vector_tools import HOOKS, Drawing
 from ways import in_way
 
 from fmugym import Choice, LogUniform, Normal, Uniform
-from fmugym.distributions import draw
-from fmugym.pool.form import form_of_draws
-from fmugym.task import native_draws as module
-from fmugym.task.episode_start import EpisodeStart
-from fmugym.task.saving import state_of as generator_state_of
-from fmugym.vector import FMUVectorEnv
-from fmugym.vector.streams import EpisodeStreams
+from fmugym.environment import episode_start as module
+from fmugym.environment.distributions import draw
+from fmugym.environment.episode_start import EpisodeStart
+from fmugym.environment.saved_episode import state_of as generator_state_of
+from fmugym.environment.vector import FMUVectorEnv
+from fmugym.environment.vector.random_streams import EpisodeStreams
+from fmugym.pool.pool_form import form_of_draws
 
 SEEDS = [
     *range(200),

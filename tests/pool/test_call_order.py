@@ -26,10 +26,9 @@ from hypothesis.stateful import (
 from ways import in_way
 
 from fmugym import FMU, FMUGymError
+from fmugym.environment.vector import FMUVectorEnv
 from fmugym.pool import PoolSpec
-from fmugym.trial.opening import open_pool
-from fmugym.trial.pool_options import PoolOptions
-from fmugym.vector import FMUVectorEnv
+from fmugym.pool.opening import PoolOptions, open_pool
 
 LOG = logging.getLogger("fmugym.test")
 N = 3

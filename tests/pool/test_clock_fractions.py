@@ -13,7 +13,7 @@ from fmpy.fmi3 import FMU3Model
 from pool_tools import KINDS, open_pool, reset, start, step
 
 from fmugym import FMU, FMULoadError
-from fmugym.archive.variable import Interval
+from fmugym.fmi.variable import Interval
 
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 INTERFACES = ("CoSimulation", "ModelExchange")

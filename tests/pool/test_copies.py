@@ -19,7 +19,7 @@ from zoo_tools import resident_bytes
 
 import fmugym
 from fmugym import SimulationError
-from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.states import SaveMethod
 
 pytestmark = pytest.mark.usefixtures("trials")  # which find out that copies work
 

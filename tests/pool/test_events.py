@@ -15,7 +15,7 @@ from pool_tools import KINDS, open_pool, reset, start, step
 from vector_tools import require_same_alone
 
 from fmugym import FMU, ConfigError
-from fmugym.tools.skeleton import Skeleton
+from fmugym.cli.class_skeleton import Skeleton
 
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)

@@ -10,8 +10,8 @@ from pool_tools import KINDS, open_pool, reset
 from ways import in_way
 
 from fmugym import FMU, ConfigError, SimulationError
+from fmugym.environment.vector import FMUVectorEnv
 from fmugym.fmi import Status
-from fmugym.vector import FMUVectorEnv
 
 KB, MB = 2**10, 2**20
 every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)

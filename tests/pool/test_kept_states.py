@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from fmugym.pool import state_files
-from fmugym.pool.state_files import StateFiles
+from fmugym.pool import states
+from fmugym.pool.states import StateFiles
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="it has no pipes among files")
 
@@ -45,7 +45,7 @@ class TestFiles:
         assert files.find("a") is None
 
     def test_are_bounded(self, files, monkeypatch):
-        monkeypatch.setattr(state_files, "MOST_BYTES", 250)
+        monkeypatch.setattr(states, "MOST_BYTES", 250)
         for number, key in enumerate("abc"):
             files.keep(key, self.STATE)
             if number < 2:

@@ -14,10 +14,10 @@ from combinations import in_turn
 from demanding_tools import DemandingEnv, expected_outputs, make_fmu
 
 import fmugym
-from fmugym.config import EnvConfig
+from fmugym.environment.config import EnvConfig
 from fmugym.errors import LicenceError
 from fmugym.pool.licences import speaks_of_licence
-from fmugym.trial.known import known_verdict
+from fmugym.pool.trial.verdict import known_verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 

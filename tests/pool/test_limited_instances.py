@@ -10,9 +10,8 @@ from process_tools import posix_only
 
 from fmugym import FMU, FMULoadError, FMUSystem
 from fmugym.pool import PoolSpec
+from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.spec import ResetMethod
-from fmugym.trial.opening import open_pool
-from fmugym.trial.pool_options import PoolOptions
 
 LOG = logging.getLogger("fmugym.test")
 VARIABLES = (("u", "input", 'start="0"'), ("y", "output", ""))

@@ -15,12 +15,12 @@ from scipy.integrate import solve_ivp
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError
+from fmugym.cli.class_skeleton import Skeleton
+from fmugym.cli.task_proposal import Proposal
+from fmugym.control.linearization import linearize
 from fmugym.fmi import Status
-from fmugym.linearization import linearize
-from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import SOLVERS
-from fmugym.tools.proposal import Proposal
-from fmugym.tools.skeleton import Skeleton
+from fmugym.pool.states import SaveMethod
 
 DERIVATIVES = 'providesDirectionalDerivative="true"'
 all_solvers = pytest.mark.parametrize("solver", SOLVERS)
@@ -344,7 +344,7 @@ def test_linear_models(fmu_path, version):
 
 
 class TestPools:
-    """The contract of ``fmugym.pool.base`` for pools of model exchange."""
+    """The contract of ``fmugym.pool.pool`` for pools of model exchange."""
 
     every_kind = pytest.mark.parametrize("kind", [*KINDS, "wine"])
     PAIRS = (("native", 3), ("native", 1), ("process", 2), ("wine", 1), ("wine", 3))

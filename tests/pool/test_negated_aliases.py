@@ -12,10 +12,10 @@ from system_tools import system
 
 import fmugym
 from fmugym import FMU, bundled_fmu
-from fmugym.linearization import linearize_along
-from fmugym.pool.form import form_of_listing
-from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import ComponentPlan
+from fmugym.control.linearization import linearize_along
+from fmugym.fmi.systems.system import SystemFMU
+from fmugym.fmi.systems.system_plan import ComponentPlan
+from fmugym.pool.pool_form import form_of_listing
 
 ALIASES = (
     ("minus_a", 0, "input", "continuous", '<Real start="0" min="-3" max="1"/>'),

@@ -13,8 +13,8 @@ from combinations import in_turn
 
 import fmugym
 from fmugym import errors
-from fmugym.archive.bundled import FMI_VERSIONS, bundled_fmu
-from fmugym.trial import opening
+from fmugym.fmi.bundled import FMI_VERSIONS, bundled_fmu
+from fmugym.pool import opening
 
 pytestmark = pytest.mark.usefixtures("trials")
 

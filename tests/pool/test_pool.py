@@ -1,4 +1,4 @@
-"""The contract of ``fmugym.pool.base``, for every implementation of it."""
+"""The contract of ``fmugym.pool.pool``, for every implementation of it."""
 
 import pickle
 from functools import partial
@@ -15,11 +15,11 @@ from system_tools import system
 from wine_tools import for_windows
 
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
-from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS, MODELS, is_bundled
-from fmugym.archive.texts import with_texts
 from fmugym.fmi import Status
-from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import ComponentPlan
+from fmugym.fmi.bundled import BUNDLED_FMUS, FMI_VERSIONS, MODELS, is_bundled
+from fmugym.fmi.systems.system import SystemFMU
+from fmugym.fmi.systems.system_plan import ComponentPlan
+from fmugym.fmi.variable import with_texts
 
 OPTIONS = {
     "fmpy": {"backend": "fmpy"},
@@ -68,7 +68,7 @@ def pools_of(request, tmp_path, opened):
         if name == "wine":
             request.getfixturevalue("wine")
             monkeypatch = request.getfixturevalue("monkeypatch")
-            monkeypatch.setattr("fmugym.archive.fmu.is_bundled", is_bundled_or_copy)
+            monkeypatch.setattr("fmugym.fmi.fmu.is_bundled", is_bundled_or_copy)
             path = for_windows(path, tmp_path)
         is_system = "system" in name
         options = OPTIONS[name] | {"reset_method": reset_method, "private_libraries": False}

@@ -13,8 +13,8 @@ from gymnasium import spaces
 from process_tools import posix_only
 
 from fmugym import FMU, FMULoadError, SimulationError
-from fmugym.archive import fmu as fmu_module
-from fmugym.pool import native
+from fmugym.fmi import fmu as fmu_module
+from fmugym.pool import native_pool
 
 METHODS = ["reset", "instance", "library", "process"]
 
@@ -33,7 +33,7 @@ def remove(folder, places):
     for place in places.split():
         shutil.rmtree(folder / place, ignore_errors=True)
         (folder / place).unlink(missing_ok=True)
-    time.sleep(2 * native._BETWEEN_LOOKS)
+    time.sleep(2 * native_pool._BETWEEN_LOOKS)
 
 
 each_removal = pytest.mark.parametrize(

@@ -23,8 +23,8 @@ import pytest
 
 import fmugym
 from fmugym import FMU
-from fmugym.pool.backend.signals import signals_held
-from fmugym.vector import FMUVectorEnv
+from fmugym.environment.vector import FMUVectorEnv
+from fmugym.pool.rig.fmpy_pool import signals_held
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -150,7 +150,7 @@ def test_the_classes_of_fmpy(fmu, make, raised, monkeypatch):
 def test_what_an_mpc_plans_on(make, raised):
     """Its copies get the signal while a plan is played; afterwards they are as good as new."""
     with make(STEP)() as env:
-        mpc = fmugym.baselines.MPC("0.6s", candidates=16, rounds=2, budget=None).bind(env)
+        mpc = fmugym.control.MPC("0.6s", candidates=16, rounds=2, budget=None).bind(env)
         observation, _ = env.reset(seed=0)
         with pytest.raises(raised[1]):
             mpc.act(observation)

@@ -20,7 +20,7 @@ import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
 from fmugym.errors import TaskError
 from fmugym.pool.spec import START_TIME
-from fmugym.series import RecordSeries
+from fmugym.records import RecordSeries
 
 STEP = 0.25
 STARTS = np.array([0.0, 1.5, 86400.25])

@@ -22,8 +22,8 @@ from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, Uniform
-from fmugym.series import RecordSeries
-from fmugym.testing import check_fmu_env
+from fmugym.environment.testing import check_fmu_env
+from fmugym.records import RecordSeries
 
 A = np.array([[-1.0, 0.5], [0.0, -2.0]])
 

@@ -69,5 +69,5 @@ def test_without_the_headers_of_python_a_wheel_is_built(tmp_path):
     assert result.returncode == 0, result.stderr
     (wheel,) = tmp_path.glob("*-none-any.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    assert "fmugym/pool/backend/by_fmpy.py" in names
+    assert "fmugym/pool/rig/fmpy_pool.py" in names
     assert not any(name.startswith("fmugym/_native.") and name[-1] != "i" for name in names)

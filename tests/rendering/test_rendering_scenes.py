@@ -400,7 +400,7 @@ class TestWindow:
             for renderer in (one, other, one, other):
                 assert renderer.render(UPRIGHT) is None
         assert not pygame.display.get_init()
-        assert [record.name for record in caplog.records] == ["fmugym.rendering.window"]
+        assert [record.name for record in caplog.records] == ["fmugym.rendering.renderer"]
         one.close()
 
     def test_keys_are_left_to_the_program(self, open_window):

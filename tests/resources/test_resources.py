@@ -14,7 +14,7 @@ from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
 import fmugym
-from fmugym.archive.bundled import BUNDLED_FMUS, FMI_VERSIONS, MODELS, bundled_fmu
+from fmugym.fmi.bundled import BUNDLED_FMUS, FMI_VERSIONS, MODELS, bundled_fmu
 
 ROOT = Path(__file__).parents[2]
 STATES = {

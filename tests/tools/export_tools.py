@@ -16,7 +16,15 @@ from fmpy import extract, read_model_description
 from fmpy.simulation import apply_start_values, instantiate_fmu
 from gymnasium import spaces
 
-from fmugym.export import Activation, Layer, Network, Scaling, agent_of, write_c, write_onnx
+from fmugym.deployment.export import (
+    Activation,
+    Layer,
+    Network,
+    Scaling,
+    agent_of,
+    write_c,
+    write_onnx,
+)
 
 FLAGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off")
 COMPILERS = {"C99": ["cc", "-std=c99"], "C++": ["c++", "-std=c++11", "-x", "c++"]}

@@ -14,8 +14,8 @@ import numpy as np
 
 import fmugym
 from fmugym.envs.house import HOUSE_TASK
-from fmugym.fit import fit_logs
-from fmugym.logs import PlantLog
+from fmugym.records.log_fit import fit_logs
+from fmugym.records.plant_log import PlantLog
 
 PARAMETERS = ("UA", "C_w", "c_m", "H_ve", "A_sol", "cop_factor", "P_max")
 NOISE = {"T": 0.1, "T_floor": 0.3, "power": 0.03}

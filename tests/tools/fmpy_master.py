@@ -7,7 +7,7 @@ import fmpy
 import numpy as np
 from fmpy.simulation import instantiate_fmu
 
-from fmugym.systems.system_plan import End
+from fmugym.fmi.systems.system_plan import End
 
 
 class Part:

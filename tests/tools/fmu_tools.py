@@ -11,8 +11,8 @@ import fmpy
 import pytest
 
 import fmugym
-from fmugym.archive import ArchiveLimits
-from fmugym.config import FOREIGN
+from fmugym.environment.config import FOREIGN
+from fmugym.fmi import ArchiveLimits
 
 MAJOR_VERSIONS = (1, 2, 3)
 HERE = Path(__file__).parents[1]

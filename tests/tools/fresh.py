@@ -11,8 +11,8 @@ import numpy as np
 from fmugym import FMU
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.backend.by_fmpy import FMPyInstance
-from fmugym.pool.backend.rig import FaultError
+from fmugym.pool.rig.fmpy_pool import FMPyInstance
+from fmugym.pool.rig.rig import FaultError
 
 LOG = logging.getLogger("fmugym.test.fresh")
 

@@ -25,13 +25,13 @@ from fuzz_driver import Case, main, require
 from lxml import etree
 
 from fmugym import FMU, FMUGymError
-from fmugym.archive import fmu as fmu_module
-from fmugym.archive.bundled import BUNDLED_FMUS, bundled_fmu
-from fmugym.config import EnvConfig
-from fmugym.task.interface import resolve
-from fmugym.task.spaces import action_space, observation_space
-from fmugym.tools.overview import as_text, overview
-from fmugym.tools.skeleton import Skeleton
+from fmugym.cli.class_skeleton import Skeleton
+from fmugym.cli.overview import as_text, overview
+from fmugym.environment.config import EnvConfig
+from fmugym.environment.interface import resolve
+from fmugym.environment.spaces import action_space, observation_space
+from fmugym.fmi import fmu as fmu_module
+from fmugym.fmi.bundled import BUNDLED_FMUS, bundled_fmu
 
 XML = "modelDescription.xml"
 

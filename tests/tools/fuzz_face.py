@@ -22,10 +22,11 @@ from odd_values import hostile
 from ways import in_way
 
 import fmugym
-from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform, testing
-from fmugym.archive import ArchiveLimits
+from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform
 from fmugym.checks import integer_of
-from fmugym.config import EnvConfig
+from fmugym.environment import testing
+from fmugym.environment.config import EnvConfig
+from fmugym.fmi import ArchiveLimits
 from fmugym.pool import Paced
 
 

@@ -35,8 +35,11 @@ from program_tools import (
 )
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
-from fmugym.pool import PoolSpec, native
-from fmugym.pool.form import (
+from fmugym.pool import PoolSpec, native_pool
+from fmugym.pool.health import no_counts
+from fmugym.pool.native_pool import prepare
+from fmugym.pool.play_form import form_of_play
+from fmugym.pool.pool_form import (
     Files,
     form_of_draws,
     form_of_listing,
@@ -44,12 +47,9 @@ from fmugym.pool.form import (
     form_of_program,
     form_of_programs,
 )
-from fmugym.pool.health import no_counts
-from fmugym.pool.native import prepare
-from fmugym.pool.play_form import form_of_play
-from fmugym.pool.process.channel import Channel
-from fmugym.pool.process.pool import ProcessPool
-from fmugym.pool.process.supervisor import Supervisor
+from fmugym.pool.processes.channel import Channel
+from fmugym.pool.processes.process_pool import ProcessPool
+from fmugym.pool.processes.supervisor import Supervisor
 
 LOG = logging.getLogger("fmugym.fuzz")
 ODD = (0, 1, 2, 3, 7, 255, -1, -2, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**61, 2**63 - 1, -(2**63))
@@ -264,7 +264,7 @@ def play_form(rng):
     def play():
         pool = _native.Pool(form_of_programs(spec, N, 1), (*own, no_counts(N)), print)
         parts, form = play_of(*own[:2]), lambda *a: damaged(rng, form_of_play(*a))
-        with mock.patch.object(native, "form_of_play", form), refusals():
+        with mock.patch.object(native_pool, "form_of_play", form), refusals():
             prepare(pool, _native.Access(form_of_listing(())), *parts)
             for _ in range(3):
                 pool.play_before(np.zeros(N))

@@ -1,4 +1,4 @@
-"""Odd arguments of ``fmugym.identification``: each call ends well or in an error of the package.
+"""Odd arguments of ``fmugym.control.identification``: each call ends well or in its own error.
 
     python tests/tools/fuzz_identification.py --count 2000 --seed 0
 
@@ -14,7 +14,7 @@ from fuzz_driver import main, of_kinds
 from odd_values import odd, spoil
 
 from fmugym import bundled_fmu
-from fmugym.identification import Trajectory, fit_parameters, plot_comparison
+from fmugym.control.identification import Trajectory, fit_parameters, plot_comparison
 
 TIME = np.arange(0.0, 0.4, 0.02)
 SWING = {"q": np.cos(9.9 * TIME), "q_dot": -9.9 * np.sin(9.9 * TIME)}

@@ -18,8 +18,8 @@ import tomlkit
 from fuzz_driver import Case, CaseError, main, require
 
 import fmugym
-from fmugym.declared.format import TASK
 from fmugym.errors import FMUGymError, FMULoadError, TaskError
+from fmugym.task.task_keys import TASK
 
 PENDULUM = {
     "version": 1,

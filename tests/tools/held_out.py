@@ -21,7 +21,7 @@ import gymnasium as gym
 import numpy as np
 
 import fmugym
-from fmugym.tools.skeleton import Skeleton
+from fmugym.cli.class_skeleton import Skeleton
 
 SETTINGS = ("single", "vector", "threads", "isolated")
 LENGTHS = (20, 40, 20)

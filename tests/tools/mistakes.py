@@ -22,10 +22,10 @@ from typing import Any, NamedTuple
 import tomlkit
 
 import fmugym
-from fmugym.config import EnvConfig
-from fmugym.declared import format as task_format
+from fmugym.cli.command_line import _parser, run_command_line
+from fmugym.environment.config import EnvConfig
 from fmugym.errors import shown
-from fmugym.tools.cli import _parser, run_command_line
+from fmugym.task import task_keys as task_format
 
 LONGEST = 500
 """Characters of a message: a user reads it in a terminal."""

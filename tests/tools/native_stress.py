@@ -45,8 +45,8 @@ from program_tools import (
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.expressions.program import TYPES
 from fmugym.pool import PoolSpec
-from fmugym.pool.form import form_of_program
-from fmugym.pool.native import NativePool
+from fmugym.pool.native_pool import NativePool
+from fmugym.pool.pool_form import form_of_program
 from fmugym.pool.spec import SOLVERS, ResetMethod
 
 THREADS = 6

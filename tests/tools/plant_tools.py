@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 import fmugym
-from fmugym.declared import Task
+from fmugym.deployment.plant import connect
+from fmugym.deployment.plant.plant_server import _Twin
+from fmugym.deployment.plant.polling import BackgroundLoop
 from fmugym.lab import ManualClock
-from fmugym.plant import connect
-from fmugym.plant.background import BackgroundLoop
-from fmugym.plant.serving import _Twin
+from fmugym.task import Task
 
 HOUSE = Path(fmugym.__file__).parent / "envs" / "house.toml"
 STEP = 900.0

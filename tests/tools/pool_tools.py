@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from fmugym.pool import PoolSpec
-from fmugym.pool.native import NativePool
-from fmugym.trial import opening
-from fmugym.trial.pool_options import PoolOptions
+from fmugym.pool import PoolSpec, opening
+from fmugym.pool.native_pool import NativePool
+from fmugym.pool.opening import PoolOptions
 
 LOG = logging.getLogger("fmugym.test")
 KINDS = {

@@ -4,8 +4,8 @@ import numpy as np
 
 from fmugym import _native
 from fmugym.expressions.program import CONSTANT, OPERATIONS, TYPES
-from fmugym.pool.form import form_of_draws, form_of_program
 from fmugym.pool.play_form import ArrayElement
+from fmugym.pool.pool_form import form_of_draws, form_of_program
 
 DISCRETE = {
     "shape": (),

@@ -25,8 +25,8 @@ from fmu_tools import PlainEnv
 from zoo_tools import ZooEnv, parameters, resident_bytes, zoo_fmu
 
 import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.envs.cart_pole import START_VALUES, CartPoleEnv
+from fmugym.fmi.bundled import FMI_VERSIONS
 
 SAMPLES = 200
 GROUPS = 10

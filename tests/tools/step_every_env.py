@@ -10,7 +10,7 @@ import sys
 import gymnasium
 
 import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
+from fmugym.fmi.bundled import FMI_VERSIONS
 
 if "--native" in sys.argv:
     import fmugym._native

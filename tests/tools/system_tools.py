@@ -8,9 +8,16 @@ import pytest
 from pool_tools import open_pool, start, step
 
 from fmugym import bundled_fmu
-from fmugym.systems import FMUSystem
-from fmugym.systems.system_fmu import SystemFMU
-from fmugym.systems.system_plan import MASTERS, ComponentPlan, Evaluation, Group, Link, SystemPlan
+from fmugym.fmi.systems import FMUSystem
+from fmugym.fmi.systems.system import SystemFMU
+from fmugym.fmi.systems.system_plan import (
+    MASTERS,
+    ComponentPlan,
+    Evaluation,
+    Group,
+    Link,
+    SystemPlan,
+)
 
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 

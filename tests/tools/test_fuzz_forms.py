@@ -4,7 +4,7 @@ import fuzz_driver
 import fuzz_forms
 from process_tools import posix_only
 
-from fmugym.pool.process import supervisor
+from fmugym.pool.processes import supervisor
 
 pytestmark = posix_only
 

@@ -3,7 +3,7 @@
 import fuzz_driver
 import fuzz_hooks
 
-from fmugym.vector import array_faults
+from fmugym.environment.vector import array_faults
 
 
 def test_odd_hooks_raise_nothing_but_our_own_errors():

@@ -12,7 +12,7 @@ from system_tools import (
     linear_fmu,
 )
 
-from fmugym.pool.native import NativePool
+from fmugym.pool.native_pool import NativePool
 
 
 def test_each_does_what_it_does_alone():

@@ -6,8 +6,8 @@ import fuzz_driver
 import fuzz_tasks
 import pytest
 
-from fmugym.declared.entries import Entry
 from fmugym.errors import TaskError
+from fmugym.task.entries import Entry
 
 
 @pytest.mark.parametrize("task", [fuzz_tasks.PENDULUM, fuzz_tasks.SWITCHED])

@@ -9,7 +9,7 @@ import held_out
 import pytest
 
 import fmugym
-from fmugym.archive.bundled import FMI_VERSIONS
+from fmugym.fmi.bundled import FMI_VERSIONS
 
 RIGHT = [[[[0.0], [2.0]]]]
 

@@ -55,7 +55,7 @@ LIBRARIES = {
         "stable-baselines3",
         'env = make_sb3_env("fmugym/CartPole-v0", num_envs=8)',
         'PPO("MlpPolicy", env, n_steps=64, batch_size=128, device="cpu").learn(1024)',
-        "from stable_baselines3 import PPO\nfrom fmugym.sb3 import make_sb3_env",
+        "from stable_baselines3 import PPO\nfrom fmugym.training.sb3 import make_sb3_env",
         extra="sb3",
     ),
     "TorchRL": Library(
@@ -74,7 +74,8 @@ LIBRARIES = {
         ).training(train_batch_size_per_learner=256, minibatch_size=128, num_epochs=1)
         config.build_algo().train()
         """,
-        "from ray.rllib.algorithms.ppo import PPOConfig\nfrom fmugym.rllib import register_task",
+        "from ray.rllib.algorithms.ppo import PPOConfig\n"
+        "from fmugym.training.rllib import register_task",
         extra="rllib",
     ),
     "skrl": Library(

@@ -20,9 +20,9 @@ import numpy as np
 from example_tools import EXAMPLES
 
 import fmugym
-from fmugym.series.intervals import confidence
-from fmugym.tools.targets import maker_of
-from fmugym.training.searching import Searching
+from fmugym.cli.targets import maker_of
+from fmugym.records.episode_statistics import confidence
+from fmugym.training.search_training import Searching
 
 sys.path.extend((str(EXAMPLES), str(EXAMPLES.parent / "benchmarks")))
 import training

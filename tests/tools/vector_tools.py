@@ -12,10 +12,10 @@ from ways import in_way
 
 import fmugym
 from fmugym import Uniform
-from fmugym.linearization import linearize_along
-from fmugym.vector import FMUVectorEnv
-from fmugym.vector.array_episodes import ArrayEpisodes
-from fmugym.vector.infos import observation_of
+from fmugym.control.linearization import linearize_along
+from fmugym.environment.vector import FMUVectorEnv
+from fmugym.environment.vector.array_episodes import ArrayEpisodes
+from fmugym.environment.vector.infos import observation_of
 
 IDS = (
     "fmugym/CartPole-v0",

@@ -10,7 +10,7 @@ from gymnasium.envs.registration import load_env_creator
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))  # for programs in this folder
 from calling import ARRAYS, EACH, EXPRESSIONS, in_python, in_way
 
-from fmugym.vector import FMUVectorEnv, vectorized
+from fmugym.environment.vector import FMUVectorEnv, vectorized
 
 __all__ = ["ALL_WAYS", "WAYS", "in_python", "in_way", "make_vec", "many"]
 

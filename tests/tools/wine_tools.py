@@ -12,7 +12,7 @@ import model_tools
 import pytest
 
 from fmugym import FMU
-from fmugym.wine.installation import can_run_windows, obstacle_to_wine
+from fmugym.fmi.wine import can_run_windows, obstacle_to_wine
 
 FOLDERS = {1: "win64", 2: "win64", 3: "x86_64-windows"}
 

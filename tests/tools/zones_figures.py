@@ -15,9 +15,9 @@ import numpy as np
 from example_tools import EXAMPLES
 
 import fmugym
-from fmugym.episodes.evaluation import HELD_OUT_SEED
-from fmugym.series.intervals import confidence
-from fmugym.training.searching import Searching
+from fmugym.records.episode_statistics import confidence
+from fmugym.records.evaluation import HELD_OUT_SEED
+from fmugym.training.search_training import Searching
 
 if str(EXAMPLES) not in sys.path:
     sys.path.append(str(EXAMPLES))

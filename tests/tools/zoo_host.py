@@ -15,8 +15,8 @@ from pathlib import Path
 
 import zoo_tools
 
-from fmugym.pool import native  # noqa: F401 (so that the forks need not import it)
-from fmugym.pool.process.output import describe_exit
+from fmugym.pool import native_pool  # noqa: F401 (so that the forks need not import it)
+from fmugym.pool.processes.channel import describe_exit
 
 
 def main(folder, *modes):

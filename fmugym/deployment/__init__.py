@@ -1,0 +1,1 @@
+"""Deployment of agents: as C, FMUs and ONNX (``export``), and beside a plant (``plant``)."""

@@ -1,1 +1,0 @@
-"""Episodes of a task: players, scores, and files."""

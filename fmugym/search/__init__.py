@@ -1,1 +1,0 @@
-"""The search for policies: weights are found by playing, without gradients."""

@@ -1,0 +1,1 @@
+"""Search for policies: weights are found by playing, without gradients."""

@@ -1,1 +1,0 @@
-"""The check whether hooks work on arrays, their results there, and their programs."""

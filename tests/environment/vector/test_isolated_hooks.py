@@ -1,0 +1,193 @@
+"""Hooks of environments whose FMUs run in worker processes."""
+
+import os
+import signal
+
+import exchange_tools
+import numpy as np
+import pytest
+from combinations import in_turn
+from gymnasium.vector import AutoresetMode
+from process_tools import FaultyEnv, faulty_fmu, start_values
+from test_vector_tasks import Delayed, Goal, Tables, Tracking
+from vector_tools import (
+    CART_POLE,
+    Drawing,
+    require_equal,
+    results_of_both,
+)
+from ways import in_way
+
+import fmugym
+from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
+from fmugym.pool.engine import Answer, Request, request_listing
+from fmugym.pool.native_pool import programs_for
+from fmugym.pool.pool_form import form_of_listing
+from fmugym.pool.processes.process_pool import ProcessPool
+
+
+@pytest.fixture(name="make")
+def fixture_make(opened):
+    def make(cls, num_envs=5, hooks="arrays", workers=2, **options):
+        if workers:
+            options |= {"isolation": "process", "workers": workers}
+        envs = opened(FMUVectorEnv(in_way(hooks, cls), num_envs, **options))
+        assert isinstance(envs.pool, ProcessPool) == bool(workers)
+        return envs
+
+    return make
+
+
+class Short(Drawing):
+    """Ends often, and begins elsewhere in each episode."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=7)
+
+
+class Sampled(fmugym.FMUEnv):
+    """What else the config may ask of a step."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
+            "bounds": {"f": (-20, 20)},
+            "time_step": 0.02,
+            "substeps": 2,
+            "warm_up": 0.1,
+            "start_time": 3.0,
+            "samplings": {"x": "mean"},
+            "monitor_names": ["phi_ddot"],
+        }
+        super().__init__(fmugym.bundled_fmu("CartPole"), config)
+
+    def _is_done(self):
+        return np.abs(self.state[2]) > 0.2
+
+
+class TwoPendulums(fmugym.FMUEnv):
+    """A system."""
+
+    def __init__(self):
+        pendulum = fmugym.bundled_fmu("Pendulum")
+        config = {
+            "model_input_names": "a.tau",
+            "model_output_names": ["a.theta", "b.theta"],
+            "model_parameters": {"a.theta_0": fmugym.Uniform(-0.1, 0.1), "b.theta_0": 0.3},
+            "bounds": {"a.tau": (-0.1, 0.1)},
+            "time_step": 0.02,
+            "max_episode_steps": 9,
+        }
+        super().__init__(fmugym.FMUSystem({"a": pendulum, "b": pendulum}, []), config)
+
+    def _is_done(self):
+        return np.abs(self.state[0]) > 3.0
+
+
+@in_turn(
+    {
+        "cls": [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables],
+        "mode": list(AutoresetMode),
+    }
+)
+def test_results_are_those_of_one_process(make, cls, mode):
+    """To the last bit, with episodes that start in every way."""
+    isolated = make(cls, 70, autoreset_mode=mode)
+    here = make(cls, 70, workers=None, autoreset_mode=mode)
+    list(results_of_both(isolated, here))
+    for name in ("variables", "previous_state", "action", "inputs", "step_count"):
+        np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
+
+
+def test_a_process_that_is_killed(make):
+    """The episodes of its block end, and the next step starts them again."""
+    isolated, here = make(Short, 4), make(Short, 4, workers=None)
+    actions = np.full((4, 1), 0.005, np.float32)
+    for envs in (isolated, here):
+        envs.reset(seed=2)
+        envs.step(actions)
+    os.kill(isolated.pool.processes()[0], signal.SIGKILL)
+    found, wanted = (envs.step(actions) for envs in (isolated, here))
+    assert found[3].tolist() == [True, True, False, False]
+    assert "SIGKILL" in found[4]["fault"][0]
+    require_equal(found[0][2:], wanted[0][2:])
+    found = isolated.step(actions)
+    assert not found[3].any()
+    assert found[4]["_drawn"].tolist() == [True, True, False, False]
+    wanted = here.step(actions)
+    require_equal(found[0][2:], wanted[0][2:])
+    assert isolated.get_attr("step_count")[0] == 0
+
+
+def test_faults_are_those_of_hooks_on_arrays(make, tmp_path):
+    path = faulty_fmu(tmp_path)
+    results = []
+    for hooks in ("arrays", "one by one"):
+        envs = make(lambda: FaultyEnv(path, "crash", call_timeout=20.0), 3, hooks, workers=3)
+        envs.set_attr("fault", [start_values("crash")["fault"], 0, 0])
+        envs.reset(seed=0)
+        rows = [envs.step(np.ones((3, 1))) for _ in range(6)]
+        results.append(rows)
+    for compiled, array in zip(*results, strict=True):
+        for ours, theirs in zip(compiled[:4], array[:4], strict=True):
+            require_equal(ours, theirs)
+        faults = [row[4].get("fault", [None])[0] for row in (compiled, array)]
+        assert [f and "SIGSEGV" in f for f in faults] in ([True, True], [None, None])
+
+
+class Free(fmugym.FMUEnv):
+    """An FMU whose memory is watched."""
+
+    def __init__(self, path):
+        config = {"model_input_names": "u", "model_output_names": "x", "bounds": {"u": (-1, 1)}}
+        super().__init__(path, config | {"time_step": 0.1, "max_episode_steps": 3})
+
+    def _is_done(self):
+        return self.out["x"] > 1e9
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_actions_of_another_type_in_a_step_that_resets(make, tmp_path, workers):
+    """The C code refuses them, and gets them converted."""
+    path = exchange_tools.exchange_fmu(tmp_path / "m.fmu", "dahlquist", 2, ("CoSimulation",))
+    envs = make(lambda: Free(path), 4, workers=workers)
+    rows = []
+    for dtype in (np.float32, np.float64):
+        envs.reset(seed=0)
+        rows.append([envs.step(np.full((4, 1), 0.5, dtype))[0] for _ in range(9)])
+    np.testing.assert_array_equal(*rows)
+
+
+def test_refused_actions_change_nothing(make):
+    envs = make(CART_POLE, 3)
+    envs.reset(seed=0)
+    envs.step([0, 1, 0])
+    snapshot = envs.save_state()
+    expected = envs.step([1, 1, 0])
+    envs.restore_state(snapshot)
+    with pytest.raises(ConfigError):
+        envs.step([0, 2, 1])
+    require_equal(envs.step([1, 1, 0])[0], expected[0])
+
+
+def test_a_pool_without_a_library_steps_nothing(make):
+    """Whatever is asked of the native pool that runs the programs, nothing crashes."""
+    envs = make(Short, 3)
+    envs.reset(seed=0)
+    around = programs_for(envs.pool, envs.pool._spec)
+    actions = np.zeros((3, 1), np.float32)
+    for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
+        with pytest.raises(ValueError, match="not prepared"):
+            getattr(around, name)(actions, *more)
+    before = envs.pool.outputs.copy()
+    assert around.step_own() == 3
+    nothing = _native.Access(form_of_listing(()))
+    assert around.reset(nothing, np.zeros((0, 3)), None, None) == 3
+    code, answer = around.ask(Request.READ, request_listing((), 2))
+    assert code == Answer.TROUBLE
+    assert answer[:8] == bytes(8)
+    np.testing.assert_array_equal(envs.pool.outputs, before)
+    around.close()
+    with pytest.raises(SimulationError, match="closed"):
+        around.step_own()
