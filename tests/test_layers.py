@@ -37,8 +37,8 @@ def layers_on(line):
 
 LAYERS, CORE = picture()
 EXCEPTIONS = {"fmugym.control.mpc": "fmugym.training.search.excitation"}
-"""Where the core opens an optional package, in a function: the surrogate of ``MPC`` comes from an FMU
-that a controller excites."""
+"""Where the core opens an optional package, in a function: the surrogate of ``MPC`` comes from an
+FMU that a controller excites."""
 
 
 def module_of(path):
