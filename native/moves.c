@@ -47,8 +47,7 @@ static const void *loaded(const Evaluation *e, const char *from, size_t step, si
 }
 
 static char *place_in(const Evaluation *e, const Row *row) {
-    char *first = row->data == NULL ? e->source->arrays[row->array] + row->offset : row->data;
-    return first + e->begin * row->stride * row->size;
+    return row_begin(row, e->source->arrays) + e->begin * row->stride * row->size;
 }
 
 static const void *load_row(const Evaluation *e, const Row *row, Register *to) {

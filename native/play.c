@@ -129,42 +129,47 @@ static inline void put(char *to, const char *from, size_t size) {
     }
 }
 
-static void start_row(const RowStart *start, const char *from, const uint32_t *starting,
+static void start_row(const RowStart *start, char *to, const char *from, const uint32_t *starting,
                       size_t count) {
     const size_t size = start->to.size;
 
     for (size_t j = 0; j < count; j++) {
         const size_t place = starting[j] * size;
-        put(start->to.data + place, from + place, size);
+        put(to + place, from + place, size);
     }
 }
 
-static void start_constant(const RowStart *start, const uint32_t *starting, size_t count) {
+static void start_constant(const RowStart *start, char *to, const uint32_t *starting,
+                           size_t count) {
     const size_t size = start->to.size;
 
     for (size_t j = 0; j < count; j++) {
-        put(start->to.data + starting[j] * size, (const char *)&start->from.bits, size);
+        put(to + starting[j] * size, (const char *)&start->from.bits, size);
     }
 }
 
 /* Fills one row after the other, because each is far from the next one in memory. */
-static void start_listed(const Turn *turn, const uint32_t *starting, size_t count) {
-    const Play *play = turn->play;
-
-    for (size_t j = 0; j < count; j++) {
-        forget_actions(&play->actions, starting[j]);
-    }
-    for (size_t i = 0; i < play->number_of_starts; i++) {
-        const RowStart *start = &play->starts[i];
+static void start_rows(const Turn *turn, const RowStarts *starts, const uint32_t *starting,
+                       size_t count) {
+    for (size_t i = 0; i < starts->count; i++) {
+        const RowStart *start = &starts->rows[i];
+        char *to = row_begin(&start->to, turn->arrays);
         if (start->kind == START_CONSTANT) {
-            start_constant(start, starting, count);
+            start_constant(start, to, starting, count);
         } else if (start->kind == START_ROW) {
-            start_row(start, start->from.row, starting, count);
+            start_row(start, to, start->from.row, starting, count);
         } else if (turn->drawn != NULL) {
-            const double *values = turn->drawn + start->from.draw * play->count;
-            start_row(start, (const char *)values, starting, count);
+            const double *values = turn->drawn + start->from.draw * turn->play->count;
+            start_row(start, to, (const char *)values, starting, count);
         }
     }
+}
+
+static void start_listed(const Turn *turn, const uint32_t *starting, size_t count) {
+    for (size_t j = 0; j < count; j++) {
+        forget_actions(&turn->play->actions, starting[j]);
+    }
+    start_rows(turn, &turn->play->starts, starting, count);
 }
 
 void play_start_episode(const Turn *turn, size_t index) {
@@ -182,18 +187,25 @@ WIDE static bool is_any(const uint8_t *flags, size_t count) {
     return any != 0;
 }
 
-void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
-    uint32_t starting[PROGRAM_WIDTH];
+/* Lists the environments of a run that start an episode instead of taking a step. */
+static size_t list_starting(const Play *play, size_t begin, size_t count, uint32_t *starting) {
     size_t number = 0;
 
-    if (!is_any(turn->play->ended + begin, count)) {
-        return;
+    if (!is_any(play->ended + begin, count)) {
+        return 0;
     }
     for (size_t index = begin; index < begin + count; index++) {
-        if (turn->play->ended[index]) {
+        if (play->ended[index]) {
             starting[number++] = (uint32_t)index;
         }
     }
+    return number;
+}
+
+void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
+    uint32_t starting[PROGRAM_WIDTH];
+    const size_t number = list_starting(turn->play, begin, count, starting);
+
     start_listed(turn, starting, number);
 }
 
@@ -220,12 +232,15 @@ void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fr
     const Play *play = turn->play;
     Source source = source_of(turn);
     Notes notes = {.outside = false};
+    uint32_t starting[PROGRAM_WIDTH];
+    const size_t number = list_starting(play, begin, count, starting);
 
     source.fresh = fresh;
     copy_rows(&play->before_conclusion, begin, count);
     program_run(&play->conclusion, &source, begin, count, &scratch->conclusion, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
     add_notes(&notes, count, verdict);
+    start_rows(turn, &play->unstepped, starting, number);
     verdict->ended += number_of(play->ended + begin, count);
 }
 

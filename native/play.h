@@ -37,7 +37,7 @@ typedef struct {
     size_t count;
 } RowCopies;
 
-/* What a row holds at the start of an episode. */
+/* What a row holds where an episode starts. */
 typedef enum { START_CONSTANT, START_ROW, START_DRAW } StartKind;
 
 typedef struct {
@@ -49,6 +49,12 @@ typedef struct {
         size_t draw;      /* the number of a draw */
     } from;
 } RowStart;
+
+/* In the order in which rows are filled. */
+typedef struct {
+    const RowStart *rows;
+    size_t count;
+} RowStarts;
 
 /* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
@@ -67,8 +73,8 @@ typedef struct {
     bool reads_kept; /* whether the conclusion reads them */
     RowCopies before_inputs;    /* what the program of the inputs is going to replace */
     RowCopies before_conclusion; /* the episode variables */
-    const RowStart *starts; /* in their order */
-    size_t number_of_starts;
+    RowStarts starts;
+    RowStarts unstepped; /* what the conclusion stores where an episode starts instead of a step */
     double *start_values; /* a row for each start variable */
     size_t number_of_parameters;
     const Draws *draws;

@@ -54,44 +54,6 @@ static RowCopies read_copies(Reader *reader, RowCopy **memory, const Rows *rows)
     return (RowCopies){copies, count};
 }
 
-static RowStart read_start(Reader *reader, const Play *play, const Rows *rows,
-                           const int64_t *numbers) {
-    RowStart start = {.to = row_of(reader, rows, numbers[0]), .kind = START_CONSTANT};
-    const size_t draws = play->draws == NULL ? 0 : play->draws->count;
-    bool fits = true;
-
-    if (numbers[1] == START_CONSTANT) {
-        start.from.bits = (uint64_t)numbers[2];
-    } else if (numbers[1] == START_ROW) {
-        const Row from = row_of(reader, rows, numbers[2]);
-        start.kind = START_ROW;
-        start.from.row = from.data;
-        fits = from.size == start.to.size && from.stride == 1;
-    } else {
-        start.kind = START_DRAW;
-        start.from.draw = (size_t)numbers[2];
-        fits = numbers[1] == START_DRAW && start.to.size == sizeof(double) &&
-               (uint64_t)numbers[2] < draws;
-    }
-    if (!fits || start.to.stride != 1) {
-        reader_refuse(reader, "a row and its start differ in type, or there is no such draw");
-    }
-    return start;
-}
-
-/* For each a row, a kind, and a number: bits of a constant, a row or a draw. */
-static void read_starts(Reader *reader, PlayForm *p, const Rows *rows) {
-    size_t count;
-    const int64_t *numbers = read_array(reader, 3 * sizeof *numbers, &count);
-
-    p->starts = reader_room(reader, count, sizeof *p->starts);
-    p->play.starts = p->starts;
-    p->play.number_of_starts = count;
-    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
-        p->starts[i] = read_start(reader, &p->play, rows, numbers + 3 * i);
-    }
-}
-
 enum { LARGEST = 1 << 24 /* elements of one environment in an array */ };
 
 /* A row in an array of a call; notes how large this must be. */
@@ -129,6 +91,43 @@ static Row row_of_program(Reader *reader, PlayForm *p, const Rows *rows, int64_t
     return stored_row(reader, p, rows->number_of_arrays, rows->stored + 4 * place);
 }
 
+static RowStart read_start(Reader *reader, PlayForm *p, const Rows *rows,
+                           const int64_t *numbers) {
+    RowStart start = {.to = row_of_program(reader, p, rows, numbers[0]), .kind = START_CONSTANT};
+    const size_t draws = p->play.draws == NULL ? 0 : p->play.draws->count;
+    bool fits = true;
+
+    if (numbers[1] == START_CONSTANT) {
+        start.from.bits = (uint64_t)numbers[2];
+    } else if (numbers[1] == START_ROW) {
+        const Row from = row_of(reader, rows, numbers[2]);
+        start.kind = START_ROW;
+        start.from.row = from.data;
+        fits = from.size == start.to.size && from.stride == 1;
+    } else {
+        start.kind = START_DRAW;
+        start.from.draw = (size_t)numbers[2];
+        fits = numbers[1] == START_DRAW && start.to.size == sizeof(double) &&
+               (uint64_t)numbers[2] < draws;
+    }
+    if (!fits || start.to.stride != 1) {
+        reader_refuse(reader, "a row and its start differ in type, or there is no such draw");
+    }
+    return start;
+}
+
+/* For each a row, a kind, and a number: bits of a constant, a row or a draw. */
+static RowStarts read_starts(Reader *reader, PlayForm *p, RowStart **memory, const Rows *rows) {
+    size_t count;
+    const int64_t *numbers = read_array(reader, 3 * sizeof *numbers, &count);
+    RowStart *starts = *memory = reader_room(reader, count, sizeof *starts);
+
+    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
+        starts[i] = read_start(reader, p, rows, numbers + 3 * i);
+    }
+    return (RowStarts){starts, count};
+}
+
 static void read_program(Reader *reader, PlayForm *p, ProgramForm *program, const Rows *rows) {
     const Block form = read_block(reader);
     size_t count;
@@ -162,11 +161,12 @@ const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t s
     read_actions(&reader, p);
     p->play.before_inputs = read_copies(&reader, &p->before_inputs, &all);
     p->play.before_conclusion = read_copies(&reader, &p->before_conclusion, &all);
-    read_starts(&reader, p, &all);
+    p->play.starts = read_starts(&reader, p, &p->starts, &all);
     read_program(&reader, p, &p->inputs, &all); /* it runs without arrays of a call */
     all.stored = read_array(&reader, 4 * sizeof *all.stored, &all.number_of_stored);
     all.number_of_arrays = MOST_ARRAYS;
     read_program(&reader, p, &p->conclusion, &all);
+    p->play.unstepped = read_starts(&reader, p, &p->unstepped, &all);
     all.number_of_arrays = p->play.number_of_seen;
     read_program(&reader, p, &p->observation, &all);
     reader_require(&reader, reader.at == reader.end, form_truncated);
@@ -206,5 +206,6 @@ void play_drop(PlayForm *p) {
     free(p->before_inputs);
     free(p->before_conclusion);
     free(p->starts);
+    free(p->unstepped);
     free(p->form);
 }

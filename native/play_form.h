@@ -13,7 +13,7 @@ typedef struct {
     ProgramForm inputs, conclusion, observation;
     char *form;         /* a copy of it, which the play points to */
     RowCopy *before_inputs, *before_conclusion;
-    RowStart *starts;
+    RowStart *starts, *unstepped;
     size_t stored_sizes[MOST_ARRAYS]; /* bytes of one environment, where programs store in an array */
 } PlayForm;
 

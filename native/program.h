@@ -184,6 +184,11 @@ typedef struct {
     Register *own;
 } Registers;
 
+/* The memory of the first instance. */
+static inline char *row_begin(const Row *row, char *const *arrays) {
+    return row->data == NULL ? arrays[row->array] + row->offset : row->data;
+}
+
 /* Writes a constant in all places of a register. */
 void program_fill(const Constant *constant, Register *filled);
 

@@ -321,10 +321,11 @@ def prepare(
             program reads them; ``before_inputs`` and ``before_conclusion``, pairs of rows: values,
             and where they are kept before a program replaces them; ``starts``, pairs of rows and
             what they hold at the start of an episode, in this order, see ``RowStart``;
-            ``results``, whether to return numbers in the place of arrays of one; and the shape and
-            type of each array: ``seen`` of observations and infos, which the pool fills with
-            float32 if no program does, then rewards, terminated and truncated of a step, mask and
-            drawn values (draws, N) of a reset.
+            ``unstepped``, the same for what the second program stores where an episode starts
+            instead of a step; ``results``, whether to return numbers in the place of arrays of
+            one; and the shape and type of each array: ``seen`` of observations and infos, which
+            the pool fills with float32 if no program does, then rewards, terminated and truncated
+            of a step, mask and drawn values (draws, N) of a reset.
     """
     rows = Rows()
     pool.prepare_play(

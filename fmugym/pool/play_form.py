@@ -33,7 +33,8 @@ class ArrayElement(NamedTuple):
 
 
 RowStart = bytes | _Row | int
-"""The start of a row: the bytes of a constant, the values of another row, or a draw's number."""
+"""The value of a row where an episode starts: the bytes of a constant, those of another row, or a
+draw's number."""
 
 
 class Rows:
@@ -82,12 +83,15 @@ def form_of_play(
     for moment in ("before_inputs", "before_conclusion"):
         pairs = surroundings[moment]
         writer.array([[number(source), number(to)] for source, to in pairs], np.int64)
-    starts = surroundings["starts"]
-    writer.array([(number(row), *_start_of(rows, source)) for row, source in starts], np.int64)
-    inputs, *others = [(form, list(map(number, own))) for form, own in programs]
+    starts, unstepped = (
+        [(number(row), *_start_of(rows, source)) for row, source in surroundings[moment]]
+        for moment in ("starts", "unstepped")
+    )
+    inputs, conclusion, observation = ((form, [*map(number, own)]) for form, own in programs)
+    writer.array(starts, np.int64)
     writer.block(inputs[0]).array(inputs[1], np.int64).array(rows.elements, np.int64)
-    for form, numbers in others:
-        writer.block(form).array(numbers, np.int64)
+    writer.block(conclusion[0]).array(conclusion[1], np.int64).array(unstepped, np.int64)
+    writer.block(observation[0]).array(observation[1], np.int64)
     return writer.form()
 
 

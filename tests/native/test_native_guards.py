@@ -317,6 +317,8 @@ class TestPrograms:
             {"before_inputs": ((np.zeros(3, "f4"), np.zeros(3)),)},
             {"before_conclusion": ((np.zeros(3, "f4"), np.zeros(3)),)},
             {"starts": ((np.zeros(3), b"1"),)},
+            {"unstepped": ((np.zeros(6, "f4"), 0),)},
+            {"unstepped": ((ArrayElement(67, 0, 1, DOUBLE), b"1"),)},
             {"starts": ((np.zeros(6), np.zeros(6, "f4")),)},
             {"kept": np.zeros((1, 1))},
         ],
@@ -349,7 +351,7 @@ class TestPrograms:
 
     def test_results_that_no_program_stores(self, cart_poles):
         with pytest.raises(ValueError, match="the arrays of results do not fit"):
-            prepare(cart_poles, program(FAILED), program(FAILED))
+            prepare(cart_poles, program(FAILED), program(FAILED), unstepped=())
 
     def test_results_where_there_are_none(self, cart_poles):
         """Before a step there are no arrays, at the start of an episode only observations."""

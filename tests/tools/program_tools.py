@@ -47,7 +47,9 @@ def results_of(count, observed, draws):
     """What a step returns: a tuple, with so many outputs that the pool observes, and draws."""
     flags, seen = ((count,), bool), ((count, observed), np.float32)
     arrays = seen, ((count,), float), flags, flags, flags, ((draws, count), float)
-    return {"seen": 1, "results": (False, arrays)}
+    zero = np.float64(0.0).tobytes()
+    unstepped = tuple((row, zero) for row in RESULT_ROWS)
+    return {"seen": 1, "results": (False, arrays), "unstepped": unstepped}
 
 
 RESULT_ROWS = tuple(ArrayElement(place, 0, 1, TYPES.index(t)) for place, t in enumerate("d??", 1))

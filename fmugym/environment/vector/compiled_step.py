@@ -206,7 +206,11 @@ def prepare_step(
         (native, streams),
         arrays.ended,
         _surroundings(env, arrays, task, starts, drawn)
-        | {"seen": len(seen), "results": (are_of_one, (*seen, *others))},
+        | {
+            "unstepped": tuple((find((kind, 0)), b"\0") for kind in (*_RESULTS, "done", "ended")),
+            "seen": len(seen),
+            "results": (are_of_one, (*seen, *others)),
+        },
     )
 
 

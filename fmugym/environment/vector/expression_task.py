@@ -201,6 +201,8 @@ class Expressions(VectorTask):
         if idle is not None:
             self.episodes.ended[:] = idle
         self._play.before(taken)
+        if idle is not None:
+            self.episodes.arrays.quantities.step_count[idle] = 0
         return taken
 
     def _checked(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:

@@ -196,10 +196,10 @@ def add_ends(
         infos: The infos.
         observations: The last observations.
         told: The last infos.
-        ended: Which episodes have ended, shape (N,); the infos keep this array.
+        ended: Which episodes have ended, shape (N,).
     """
-    infos["final_obs"], infos["final_info"] = observations, told
-    infos["_final_obs"] = infos["_final_info"] = ended
+    infos["final_obs"], infos["_final_obs"] = observations, ended.copy()
+    infos["final_info"], infos["_final_info"] = told, ended.copy()
 
 
 def restricted(infos: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:

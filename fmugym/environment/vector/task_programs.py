@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import chain
+from operator import or_
 from typing import Any, Final
 
 import numpy as np
@@ -83,8 +85,7 @@ class TaskPrograms:
         """
         graph, real = Graph(), np.dtype(np.float64)
         stopped = Value(graph, graph.load("stopped", None, _FLAG))
-        never, nothing = Value.of(graph, False), Value.of(graph, 0.0)
-        conclusion = compile_graph(graph, ended(stopped, never, nothing, limit))
+        conclusion = compile_graph(graph, ended(stopped, None, None, limit))
         graph = Graph()
         given = [graph.load("row", ("given", i), real) for i in range(inputs)]
         stores = [Store(node, ("input", i)) for i, node in enumerate(given)]
@@ -105,35 +106,31 @@ class TaskPrograms:
 
 
 def counted(graph: Graph) -> Store:
-    """Count a step, but none of an environment that starts an episode instead."""
-    is_fresh, count = _row(graph, "ended", _FLAG), _row(graph, "step_count", _COUNT)
-    none, more = Value.of(graph, 0).cast(_COUNT), (count + 1).cast(_COUNT)
-    return Store(graph.choose(is_fresh.node, none.node, more.node), ("step_count", 0))
+    """Count a step."""
+    return Store((_row(graph, "step_count", _COUNT) + 1).cast(_COUNT).node, ("step_count", 0))
 
 
-def ended(terminated: Value, truncated: Value, reward: Value, limit: int) -> list[Store]:
+def ended(
+    terminated: Value, truncated: Value | None, reward: Value | None, limit: int
+) -> list[Store]:
     """Store the results of a step, and which episodes have ended.
-
-    An environment that has started an episode instead of a step has no reward and no end.
 
     Args:
         terminated: Where tasks have ended.
-        truncated: Where they are cut.
-        reward: The rewards.
+        truncated: Where they are cut; None if by the limit only.
+        reward: The rewards; None if there are none.
         limit: The steps after which an episode is truncated, too.
     """
     graph = terminated.graph
-    is_fresh = _row(graph, "ended", _FLAG)
-    has_stepped: Value = np.logical_not(is_fresh)
+    cuts = [] if truncated is None else [truncated]
     if limit < sys.maxsize:
-        truncated = truncated | (_row(graph, "step_count", _COUNT) >= limit)
-    terminated, truncated = terminated & has_stepped, truncated & has_stepped
+        cuts.append(_row(graph, "step_count", _COUNT) >= limit)
     results = {
-        "reward": where(is_fresh, 0.0, reward),
+        "reward": Value.of(graph, 0.0) if reward is None else reward.number,
         "terminated": terminated,
-        "truncated": truncated,
+        "truncated": reduce(or_, cuts) if cuts else Value.of(graph, False),
         "done": terminated,
-        "ended": terminated | truncated,
+        "ended": reduce(or_, cuts, terminated),
     }
     return [Store(value.node, (kind, 0)) for kind, value in results.items()]
 
@@ -259,8 +256,7 @@ def _conclusion(env: FMUEnv, formulas: Formulas, limit: int) -> tuple[Program, t
         done = Translation(env, graph, True, dict(known)).of(formulas.terminated) | stopped
     values = Translation(env, graph, True, known | {("done",): done})
     truncated, reward = (
-        values.of(one) if one is not None else Value.of(graph, default)
-        for one, default in ((formulas.truncated, False), (formulas.reward, 0.0))
+        None if one is None else values.of(one) for one in (formulas.truncated, formulas.reward)
     )
     shown = Translation(env, graph, True, known | {("done",): done & has_stepped})
     for number, (_, elements) in enumerate(_seen(env, formulas, shown)):
