@@ -19,8 +19,7 @@ native = Extension(
     "fmugym._native",
     sources=sorted(
         str(path)
-        for folder in (".", "python", "worker")
-        for path in Path("native", folder).glob("*.c")
+        for path in Path("native").glob("*/*.c")
         if path.name != "main.c"  # of the worker program, which fmugym.fmi.wine builds
     ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),

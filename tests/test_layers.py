@@ -110,6 +110,20 @@ def test_the_name_of_a_file_tells_it_from_all_others():
     assert {name for name, count in often.items() if count > 1} == {"__init__.py"}
 
 
+def test_a_c_file_includes_files_of_its_folder_and_of_those_below():
+    native = ROOT / "native"
+    picture = (native / "README.md").read_text(encoding="utf-8").split("```")[1]
+    folders = re.findall(r"^(\w+) ", picture, re.MULTILINE)
+    assert set(folders) == {path.parent.name for path in native.rglob("*.[ch]")}
+    upwards = []
+    for place, folder in enumerate(folders):
+        for path in (native / folder).glob("*.[ch]"):
+            included = re.findall(r'#include "(.+)"', path.read_text(encoding="utf-8"))
+            above = [name for name in included if name.split("/")[0] not in folders[place:]]
+            upwards += [f"{path.name}: {name}" for name in above]
+    assert upwards == []
+
+
 def test_no_module_imports_itself_by_a_detour():
     graph = {m: (imports_of(m) & MODULES.keys()) - {EXCEPTIONS.get(m)} for m in MODULES}
     while leaves := {module for module, targets in graph.items() if not targets}:

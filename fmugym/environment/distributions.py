@@ -60,7 +60,7 @@ class Recipe(NamedTuple):
     """Form of a distribution in which the C extension draws exactly the values of ``sample``.
 
     Attributes:
-        kind: One of the kinds of ``native/draws.h``.
+        kind: One of the kinds of ``native/program/draws.h``.
         numbers: The numbers that this kind needs.
         limits: All values lie between these.
     """

@@ -56,7 +56,7 @@ OPERATIONS: Final = (
     *("power f", "fmod d", "copysign d"),
     *(f"{name} {letter}" for letter in "dq" for name in ("remainder", "floor_divide")),
 )
-"""The operations in the order of ``enum Operation`` of ``native/program.h``."""
+"""The operations in the order of ``enum Operation`` of ``native/program/program.h``."""
 
 TYPES: Final = "dfq?b"
 """The types of values: letters of numpy, in the order of ``VALUE_DOUBLE`` and so on there.
@@ -68,7 +68,7 @@ MOST_REGISTERS: Final = 256
 """The native pool has this many registers for each program."""
 
 CONSTANT: Final = np.dtype([("bits", "u8"), ("to", "u2"), ("size", "u2"), ("unused", "u4")])
-"""The layout of ``Constant`` in ``native/program.h``."""
+"""The layout of ``Constant`` in ``native/program/program.h``."""
 
 
 def require_same_table(native: Any) -> None:
@@ -152,7 +152,7 @@ class Program:
 
     Attributes:
         code: Operation, extra, the register to write, three operands; shape (n, 6). What extra
-            means depends on the operation; see ``native/program.h``.
+            means depends on the operation; see ``native/program/program.h``.
         constants: Registers that keep a value; of type ``CONSTANT``.
         rows: The rows that are loaded or stored.
         tables: Values to look up.

@@ -251,7 +251,7 @@ class Variable:
 
     @property
     def number(self) -> int:
-        """Of a clock: its kind as ``enum ClockKind`` of ``native/clock.h``."""
+        """Of a clock: its kind as ``enum ClockKind`` of ``native/model_exchange/clock.h``."""
         is_output = self.ticking == "triggered" and self.causality != "input"
         return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
 

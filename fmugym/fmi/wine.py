@@ -91,19 +91,23 @@ def alone(name: str) -> Iterator[None]:
 def sources() -> tuple[Path, ...]:
     """The C files of the program and their headers; empty if they are not installed."""
     for folder in _FOLDERS:
-        found = [*folder.glob("*.[ch]"), *folder.glob("worker/*.[ch]")]
+        found = [p for p in folder.glob("*/*.[ch]") if p.parent.name != "python"]
         if found:
             return tuple(sorted(found))
     return ()
+
+
+def _top() -> str:
+    """The folder above all sources, whose name differs in a checkout."""
+    return os.path.commonpath(sources()) if sources() else ""
 
 
 @functools.cache
 def _digest() -> str:
     """Stands for the sources and the options."""
     digest = hashlib.sha256(repr(_OPTIONS).encode())
-    folder = os.path.commonpath(sources()) if sources() else ""  # its name differs in a checkout
     for path in sources():
-        digest.update(f"{path.relative_to(folder).as_posix()}\0".encode())
+        digest.update(f"{path.relative_to(_top()).as_posix()}\0".encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -158,7 +162,8 @@ def _build() -> Path:
 
 def _compile(target: Path) -> None:
     files = [str(path) for path in sources() if path.suffix == ".c"]
-    command = [sys.executable, "-m", "ziglang", "cc", *_OPTIONS, *files, "-o", str(target)]
+    options = (*_OPTIONS, f"-I{_top()}")
+    command = [sys.executable, "-m", "ziglang", "cc", *options, *files, "-o", str(target)]
     try:
         subprocess.run(
             command,

@@ -109,7 +109,7 @@ Variables = tuple[Variable, ...]
 
 
 Ask = Callable[[bool, int, int, Variables, Variables], FloatArray]
-"""Asks an engine to differentiate; see ``native/derivatives.h``.
+"""Asks an engine to differentiate; see ``native/pool/derivatives.h``.
 
 The arguments are: whether the FMU differentiates unknowns by all knowns, not all unknowns by a
 known; the component of a system, 0 for an FMU; the version as of

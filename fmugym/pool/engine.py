@@ -1,9 +1,9 @@
 """Engine: requests to it, in this process or through a worker, its answers, and its pools.
 
-The tables of CONTRIBUTING.md say what a request and an answer consist of. ``native/requests.c`` is
-the other end. A worker runs foreign code, so its answers may be anything. What does not fit the
-request is an error, which ends the worker. The pools of the engine share their requests besides
-steps and resets.
+The tables of CONTRIBUTING.md say what a request and an answer consist of.
+``native/pool/requests.c`` is the other end. A worker runs foreign code, so its answers may be
+anything. What does not fit the request is an error, which ends the worker. The pools of the engine
+share their requests besides steps and resets.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ __all__ = [
 
 
 class Request(IntEnum):
-    """The codes of requests, in the order of ``native/requests.h``."""
+    """The codes of requests, in the order of ``native/pool/requests.h``."""
 
     OPEN = 0
     STEP = 1
@@ -59,7 +59,7 @@ class Request(IntEnum):
 
 
 class Answer(IntEnum):
-    """Codes of answers, by the letters of ``native/requests.h``."""
+    """Codes of answers, by the letters of ``native/pool/requests.h``."""
 
     RESULT = ord("R")
     TROUBLE = ord("T")

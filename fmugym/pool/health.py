@@ -39,7 +39,7 @@ HEALTH: Final = (
     "recyclings",
     "deaths",
 )
-"""The names of the counters, in the order of the columns and of ``native/pool.h``."""
+"""The names of the counters, in the order of the columns and of ``native/pool/pool.h``."""
 
 HEALTH_COUNTS: Final = len(HEALTH) + 1
 """The number of columns of an array of counts; the last column has the last step's retries."""

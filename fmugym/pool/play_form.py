@@ -1,4 +1,4 @@
-"""Form of the programs around steps of a vector environment; ``native/play_form.c`` reads it."""
+"""Form of programs around steps of a vector environment; ``native/pool/play_form.c`` reads it."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def form_of_play(
 
 
 def _start_of(rows: Rows, source: RowStart) -> tuple[int, int]:
-    """The kind of a start, a ``StartKind`` of ``native/play.h``, and its number."""
+    """The kind of a start, a ``StartKind`` of ``native/pool/play.h``, and its number."""
     if isinstance(source, bytes):
         return 0, _bits_of(source)
     return (2, source) if isinstance(source, int) else (1, rows.number(source))

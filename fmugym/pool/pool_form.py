@@ -1,7 +1,8 @@
 """Forms that open a pool of the C extension, as bytes.
 
 ``NativePool`` hands the bytes to the C extension of this process, and ``ProcessPool`` to those of
-its workers. ``native/pool_form.c`` and ``native/program_form.c`` read them, in the same order.
+its workers. ``native/pool/pool_form.c`` and ``native/program/program_form.c`` read them, in the
+same order.
 
 A form is a row of numbers of 8 bytes: integers, flags and floating-point numbers. A block has its
 size before it, and zeros after it up to the next multiple of 8. A text is a block that ends with a
@@ -53,7 +54,7 @@ __all__ = [
 ]
 
 _VERSION: Final = 1
-"""Of all forms and of the requests to workers; ``native/form.h`` has the same number."""
+"""Of all forms and of the requests to workers; ``native/forms/form.h`` has the same number."""
 
 _TYPES: Final = (
     "Float64",
@@ -73,10 +74,10 @@ _TYPES: Final = (
     "-Int32",
     "-Boolean",
 )
-"""The C types in the order of ``enum Type`` of ``native/fmi.h``; those of negated aliases last."""
+"""The C types, ordered like ``enum Type`` of ``native/fmi/fmi.h``; negated aliases come last."""
 
 START_TIME_TYPE: Final = 255
-"""Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
+"""Stands for a type where the start time is meant; ``native/fmi/access.h`` has the same number."""
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
 
@@ -88,7 +89,7 @@ BLANK: Final = 8
 """Every item begins at a multiple of so many bytes."""
 
 _RESET_METHODS: Final = tuple(ResetMethod)
-"""In the order of ``ResetMethod`` of ``native/system.h``."""
+"""In the order of ``ResetMethod`` of ``native/system/system.h``."""
 
 _NO_FMU: Final = ModelDescription(
     *("2.0", "", "", "", (), "", ""), *(0.0, None, None, None, None), Capabilities(), {}, {}, ()
@@ -194,7 +195,7 @@ def table_of(description: ModelDescription) -> int:
 
 
 def manner_of(description: ModelDescription) -> int:
-    """The number of the way in which the FMU is run, one of ``enum Manner`` of ``native/fmi.h``."""
+    """The number of the way to run the FMU, one of ``enum Manner`` of ``native/fmi/fmi.h``."""
     if description.model_exchange is not None:
         return 1
     return 2 if description.uses_event_mode else 0
@@ -342,7 +343,7 @@ def _write_solving(writer: Writer, description: ModelDescription, spec: PoolSpec
 
 
 def _clocks(description: ModelDescription) -> tuple[bytes, bytes]:
-    """The arrays of ``Clock`` and ``Clocked`` of ``native/clock.h``."""
+    """The arrays of ``Clock`` and ``Clocked`` of ``native/model_exchange/clock.h``."""
     clocks = description.clocks
     indices = {clock.value_reference: index for index, clock in enumerate(clocks)}
     return (

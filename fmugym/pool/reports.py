@@ -82,7 +82,7 @@ _KEYS: Final = {
 """Patterns of requests, by the key of a config that answers them."""
 
 _END: Final = "\x1e"
-"""Ends a message in the texts of ``fmugym._native``; see ``native/log.h``."""
+"""Ends a message in the texts of ``fmugym._native``; see ``native/fmi/log.h``."""
 
 
 def as_messages(lines: Iterable[str]) -> list[Message]:
@@ -151,7 +151,7 @@ _ADVICE: Final = (
 )
 
 REFUSED_ANEW: Final = "the FMU refused to be instantiated anew"
-"""How a failure of an instance begins that could not be made again; see ``native/instances.c``."""
+"""How a failure begins if an instance cannot be made again; see ``native/pool/instances.c``."""
 
 FRESH_PROCESSES: Final = (
     '; if it makes only so many instances in one process, isolation="process" goes on in fresh '
@@ -163,14 +163,14 @@ MORE_PROCESSES: Final = "; if it makes only so many instances in one process, gi
 """What helps against refusals in a worker process that makes several instances."""
 
 _REFUSED: Final = "it refused to be instantiated"
-"""How an error of the extension begins if an instance cannot be made; see ``native/pools.c``."""
+"""How the extension's error begins if an instance cannot be made; see ``native/pool/pools.c``."""
 
 _SAID: Final = "\x1d"
-"""Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
+"""Stands before the FMU's messages in an error of the extension; see ``native/fmi/log.h``."""
 
 
 class Failure(NamedTuple):
-    """Why the last status of an instance was bad; see ``Failure`` of ``native/pool.h``."""
+    """Why the last status of an instance was bad; see ``Failure`` of ``native/pool/pool.h``."""
 
     doing: str
     in_warm_up: bool

@@ -71,7 +71,7 @@ def _variables_of(
 _START: Final = np.dtype(
     [("value", "f8"), *((name, "u4") for name in ("type", "reference", "place", "size"))]
 )
-"""A start value among recorded inputs; ``RecordedStart`` of ``native/pool.h``."""
+"""A start value among recorded inputs; ``RecordedStart`` of ``native/pool/pool.h``."""
 
 
 @dataclass(frozen=True, eq=False)

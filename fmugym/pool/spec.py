@@ -34,14 +34,14 @@ ISOLATIONS: Final = ("none", "process")
 SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 """What a step gives of the values that an output has after each of its substeps.
 
-The order is that of ``Sampling`` in ``native/pool.h``.
+The order is that of ``Sampling`` in ``native/pool/pool.h``.
 """
 
 FIXED_STEP_SOLVERS: Final = ("euler", "rk4")
 """The methods of integration whose steps do not depend on the tolerance."""
 
 SOLVERS: Final = ("dormand_prince", "euler", "rk4", "rosenbrock")
-"""The methods of integration for model exchange; see ``native/methods.h``."""
+"""The methods of integration for model exchange; see ``native/model_exchange/methods.h``."""
 
 DEFAULT_TOLERANCE: Final = 1e-6
 """Relative tolerance of the solver where neither the config nor the FMU gives one: float32

@@ -51,10 +51,10 @@ SIZE_OF_HEAD: Final = _HEAD.size
 _ENDED: Final = 0
 _RECORD: Final = 2
 _SURROGATE: Final = 3
-"""Kinds of states. The C extension makes all but the last one; see ``native/states.h``."""
+"""Kinds of states. The C extension makes all but the last one; see ``native/pool/states.h``."""
 
 NO_SNAPSHOT: Final = 0
-"""No number of a snapshot; ``native/snapshots.h`` has the same."""
+"""No number of a snapshot; ``native/pool/snapshots.h`` has the same."""
 
 
 class SaveMethod(StrEnum):

@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "python.h"
+#include "python/python.h"
 
 PyTypeObject *access_type;
 

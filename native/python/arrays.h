@@ -3,7 +3,7 @@
 #ifndef FMUGYM_ARRAYS_H
 #define FMUGYM_ARRAYS_H
 
-#include "python.h"
+#include "python/python.h"
 
 enum {
     MOST_ARRAY_DIMENSIONS = 64, /* more than that numpy has none */

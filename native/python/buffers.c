@@ -1,6 +1,6 @@
 /* Checks of the arrays of a caller: type, shape and alignment. */
 
-#include "buffers.h"
+#include "python/buffers.h"
 
 #include <stdint.h>
 #include <stdio.h>

@@ -1,7 +1,7 @@
 /* The type Draws: the distributions of an episode. Also the seeding of random streams. */
 
-#include "program_form.h"
-#include "python.h"
+#include "program/program_form.h"
+#include "python/python.h"
 
 PyTypeObject *draws_type;
 

@@ -5,7 +5,7 @@
  * the FMU tells that it has failed. So handlers only note that the signal came while it works, and the
  * handlers of the caller run after the call. */
 
-#include "handlers.h"
+#include "python/handlers.h"
 
 enum { MOST_SIGNALS = 128 };
 

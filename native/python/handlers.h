@@ -3,7 +3,7 @@
 #ifndef FMUGYM_HANDLERS_H
 #define FMUGYM_HANDLERS_H
 
-#include "python.h"
+#include "python/python.h"
 
 enum { MOST_HELD = 32 };
 

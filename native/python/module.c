@@ -2,11 +2,11 @@
 
 #include <string.h>
 
-#include "arrays.h"
-#include "handlers.h"
-#include "programs.h"
+#include "python/arrays.h"
+#include "python/handlers.h"
+#include "python/programs.h"
 
-#include "threads.h"
+#include "pool/threads.h"
 
 static PyObject *tuple_of(const char *const *texts, Py_ssize_t count) {
     PyObject *names = PyTuple_New(count);

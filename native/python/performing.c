@@ -2,8 +2,8 @@
 
 #include <string.h>
 
-#include "handlers.h"
-#include "inside.h"
+#include "pool/inside.h"
+#include "python/handlers.h"
 
 PyObject *find_object(const char *module_name, const char *name) {
     PyObject *module = PyImport_ImportModule(module_name);

@@ -1,6 +1,6 @@
-/* Preparing a pool to play: see play.h. */
+/* Preparing a pool to play: see pool/play.h. */
 
-#include "playing.h"
+#include "python/playing.h"
 
 #include <stdint.h>
 #include <stdlib.h>

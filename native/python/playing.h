@@ -3,10 +3,10 @@
 #ifndef FMUGYM_PLAYING_H
 #define FMUGYM_PLAYING_H
 
-#include "play_form.h"
-#include "player.h"
-#include "programs.h"
-#include "results.h"
+#include "pool/play_form.h"
+#include "pool/player.h"
+#include "python/programs.h"
+#include "python/results.h"
 
 enum {
     STARTS,

@@ -1,6 +1,6 @@
 /* The arguments that a pool is made of: a form, and the arrays of the caller. */
 
-#include "python.h"
+#include "python/python.h"
 
 static bool take_form(PyPool *self, const char *form, Py_ssize_t size) {
     const char *fault = opening_take(&self->opening, form, (size_t)size);

@@ -2,8 +2,8 @@
 
 #include <stdlib.h>
 
-#include "python.h"
-#include "requests.h"
+#include "pool/requests.h"
+#include "python/python.h"
 
 /* A call and its result. */
 typedef struct {
@@ -155,7 +155,7 @@ PyObject *py_count_steps(PyObject *object, PyObject *unused) {
     return perform((PyPool *)object, NEVER_SHORT, do_count_steps, NULL) ? Py_NewRef(Py_None) : NULL;
 }
 
-/* What is asked for besides steps and resets: see ../requests.h. */
+/* What is asked for besides steps and resets: see pool/requests.h. */
 
 typedef struct {
     Request request;

@@ -1,6 +1,6 @@
-/* The methods of the type Pool for playing: see play.h. */
+/* The methods of the type Pool for playing: see pool/play.h. */
 
-#include "playing.h"
+#include "python/playing.h"
 
 #include <stdint.h>
 #include <string.h>

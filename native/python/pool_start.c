@@ -1,6 +1,6 @@
-/* The method of the type Pool that starts episodes outside of a step: see play.h. */
+/* The method of the type Pool that starts episodes outside of a step: see pool/play.h. */
 
-#include "playing.h"
+#include "python/playing.h"
 
 #include <string.h>
 

@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "handlers.h"
+#include "python/handlers.h"
 
 /* Closing */
 

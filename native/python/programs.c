@@ -1,6 +1,6 @@
 /* Programs, taken over from Python. */
 
-#include "programs.h"
+#include "python/programs.h"
 
 #include <stdlib.h>
 #include <string.h>

@@ -3,8 +3,8 @@
 #ifndef FMUGYM_PROGRAMS_H
 #define FMUGYM_PROGRAMS_H
 
-#include "program_form.h"
-#include "python.h"
+#include "program/program_form.h"
+#include "python/python.h"
 
 enum { MOST_DIMENSIONS = 8 }; /* of an action */
 

@@ -10,9 +10,9 @@
 #error "Python without the GIL is not supported: the GIL guards the objects of this extension"
 #endif
 
-#include "buffers.h"
-#include "draws.h"
-#include "pool_form.h"
+#include "pool/pool_form.h"
+#include "program/draws.h"
+#include "python/buffers.h"
 
 enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 
@@ -58,7 +58,7 @@ typedef void Work(PyPool *self, bool alone, void *context);
 
 enum { NEVER_SHORT = -1 };
 
-/* Does some work. length is one of the operations of pool.h, whose duration the pool knows, or
+/* Does some work. length is one of the operations of pool/pool.h, whose duration the pool knows, or
  * NEVER_SHORT. Returns false with an exception if the pool cannot be entered. */
 bool perform(PyPool *self, int length, Work *work, void *context);
 /* Sets the exception of an entry that was refused. Returns whether it was not. */

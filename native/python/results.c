@@ -1,11 +1,11 @@
 /* The arrays of a step or a reset: taken over once, provided for each call, and returned in tuples. */
 
-#include "results.h"
+#include "python/results.h"
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "arrays.h"
+#include "python/arrays.h"
 
 struct Results {
     bool are_of_one;

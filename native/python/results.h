@@ -3,8 +3,8 @@
 #ifndef FMUGYM_RESULTS_H
 #define FMUGYM_RESULTS_H
 
-#include "python.h"
-#include "program.h"
+#include "program/program.h"
+#include "python/python.h"
 
 /* After the arrays of observations and infos come those that only a step has, then those that only
  * starts of episodes have. */

@@ -1,9 +1,9 @@
-/* The functions of the module that make a process a worker: see ../worker/worker.h. */
+/* The functions of the module that make a process a worker: see worker/worker.h. */
 
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "programs.h"
+#include "python/programs.h"
 
 #include "worker/worker.h"
 

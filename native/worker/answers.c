@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "worker.h"
+#include "worker/worker.h"
 
 /* Ends this process if an FMU has forked it and returned in it as well. */
 static void end_twin(const Worker *w) {

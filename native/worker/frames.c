@@ -1,6 +1,6 @@
 /* Messages over a connection. */
 
-#include "frames.h"
+#include "worker/frames.h"
 
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,7 +1,7 @@
 /* Messages between a worker and the process that has started it.
  *
  * A message is a head of two numbers, a code and a size, and a content of this size: a form, see
- * ../form.h. fmugym/pool/processes/channel.py is the other end. */
+ * forms/form.h. fmugym/pool/processes/channel.py is the other end. */
 
 #ifndef FMUGYM_FRAMES_H
 #define FMUGYM_FRAMES_H
@@ -10,7 +10,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "../platform.h"
+#include "shared/platform.h"
 
 /* One end of a connection: on Windows the handles of a stream to read and of another one to write, or
  * both those of a socket; elsewhere the descriptor of a socket. */

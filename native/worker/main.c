@@ -3,7 +3,7 @@
  * Requests come on the standard input. Answers go to the standard output, and what the FMU prints to
  * the standard error. */
 
-#include "worker.h"
+#include "worker/worker.h"
 
 #include <fcntl.h>
 #include <io.h>

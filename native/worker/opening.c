@@ -4,8 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "../library.h"
-#include "worker.h"
+#include "fmi/library.h"
+#include "worker/worker.h"
 
 #if !defined _WIN32
 #include <dlfcn.h>

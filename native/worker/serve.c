@@ -2,7 +2,7 @@
 
 #include <stdlib.h>
 
-#include "worker.h"
+#include "worker/worker.h"
 
 static const size_t LARGEST_REQUEST = (size_t)1 << 40; /* bytes; no memory is as large */
 

@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "worker.h"
+#include "worker/worker.h"
 
 #if defined _WIN32
 /* Windows' own header of this function needs another library. */

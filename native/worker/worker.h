@@ -4,9 +4,9 @@
 #ifndef FMUGYM_WORKER_H
 #define FMUGYM_WORKER_H
 
-#include "../pool_form.h"
-#include "../requests.h"
-#include "frames.h"
+#include "pool/pool_form.h"
+#include "pool/requests.h"
+#include "worker/frames.h"
 
 /* The arrays that the process shares with its parent; see fmugym/pool/processes/shared_memory.py. They have
  * no gaps. */

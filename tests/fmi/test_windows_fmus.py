@@ -137,6 +137,7 @@ class TestProgram:
                     "cc",
                     "-c",
                     *windows_worker._OPTIONS,
+                    f"-I{path.parents[1]}",
                     path,
                 ]
                 done = subprocess.run(

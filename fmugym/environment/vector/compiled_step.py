@@ -152,7 +152,7 @@ def _first(array: npt.NDArray[Any]) -> Any:
 
 
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
-"""The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
+"""The numbers of ``ActionCheck`` in ``native/pool/play.h``: what refuses a NaN."""
 
 _RESULTS: Final = {
     kind: TYPES.index(letter)

@@ -1,6 +1,6 @@
 """Memory layout of a system: slots of inputs and outputs, and the routes between them.
 
-``fmugym.pool.pool_form`` tells it to ``native/system_steps.c``.
+``fmugym.pool.pool_form`` tells it to ``native/system/system_steps.c``.
 """
 
 from __future__ import annotations

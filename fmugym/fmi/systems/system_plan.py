@@ -3,7 +3,7 @@
 A plan holds names and numbers only: it can be pickled, compared and hashed. Whoever makes one
 (Python, a task file, an SSP archive) has resolved units into gains and offsets, and has put the
 components and links in order. ``fmugym.fmi.systems.system`` makes a system of it, which
-``native/system_steps.c`` runs.
+``native/system/system_steps.c`` runs.
 
 One step of the master with the communication step size h:
 

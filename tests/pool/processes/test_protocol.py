@@ -8,7 +8,7 @@ import pytest
 from fmugym.pool.engine import Answer, Request
 
 ROOT = Path(__file__).parents[3]
-HEADER = (ROOT / "native" / "requests.h").read_text()
+HEADER = (ROOT / "native" / "pool" / "requests.h").read_text()
 PAGE = (ROOT / "CONTRIBUTING.md").read_text()
 
 
