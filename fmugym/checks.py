@@ -35,7 +35,6 @@ __all__ = [
     "check_flag",
     "check_integer",
     "check_mapping",
-    "check_misplaced",
     "check_number",
     "check_option",
     "check_path",
@@ -49,6 +48,7 @@ __all__ = [
     "normal_form",
     "number_of",
     "parts_of_array",
+    "refuse_positional",
     "require_regular",
 ]
 
@@ -191,7 +191,7 @@ def check_integer(what: str, value: Any, minimum: int, maximum: int) -> int:
     return number
 
 
-def check_misplaced(given: tuple[object, ...]) -> None:
+def refuse_positional(given: tuple[object, ...]) -> None:
     """Refuse arguments of ``reset`` that are given without their names.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Observer of a plant: copies of an FMU that follow it, weighted by their errors."""
+"""Observer of a plant: it finds the copy of an FMU that is nearest to the measurements."""
 
 from __future__ import annotations
 

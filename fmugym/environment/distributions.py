@@ -30,6 +30,8 @@ from fmugym.checks import (
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
+    "DISTRIBUTIONS",
+    "OWN_DISTRIBUTIONS",
     "Choice",
     "Distribution",
     "DrawnColumn",
@@ -98,6 +100,10 @@ class Uniform(KnownArguments):
         """Draw one value."""
         return self.low + (self.high - self.low) * rng.random()
 
+    def support(self) -> tuple[float, float]:
+        """Lowest and highest possible value."""
+        return float(self.low), float(self.high)
+
     def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
         return Recipe("uniform", (self.low, self.high - self.low), (self.low, self.high))
 
@@ -122,6 +128,10 @@ class LogUniform(KnownArguments):
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value."""
         return math.exp(rng.uniform(math.log(self.low), math.log(self.high)))
+
+    def support(self) -> tuple[float, float]:
+        """Lowest and highest possible value."""
+        return float(self.low), float(self.high)
 
     def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
         low, high = math.log(self.low), math.log(self.high)
@@ -168,6 +178,10 @@ class Normal(KnownArguments):
             if self.low <= value <= self.high and math.isfinite(value):
                 return value
 
+    def support(self) -> tuple[float, float]:
+        """Lowest and highest possible value."""
+        return float(self.low), float(self.high)
+
     def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
         limits = max(self.low, -_LARGEST), min(self.high, _LARGEST)
         return Recipe("normal", (self.mean, self.std, self.low, self.high), limits)
@@ -211,6 +225,11 @@ class Choice(KnownArguments):
         """Draw one value."""
         index = rng.choice(len(self.values), p=self.probabilities)
         return self.values[int(index)]
+
+    def support(self) -> tuple[float, float]:
+        """Lowest and highest possible value."""
+        numbers = list(map(float, self.values))
+        return min(numbers), max(numbers)
 
     def _recipe(self, convert: Callable[[Any], float]) -> Recipe:
         values = tuple(map(convert, self.values))
@@ -277,10 +296,10 @@ class Truncated:
         return self.low, self.high
 
 
-_KINDS: Final[Mapping[str, type[Any]]] = {
+DISTRIBUTIONS: Final[Mapping[str, type[Any]]] = {
     kind.distribution: kind for kind in (Uniform, LogUniform, Normal, Choice)
 }
-_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), DrawnColumn)
+OWN_DISTRIBUTIONS: Final[tuple[type[Any], ...]] = (*DISTRIBUTIONS.values(), DrawnColumn)
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _LEAST_SHARE: Final = 0.01
 """Of the draws that must lie within limits, so that there are few redraws."""
@@ -290,12 +309,10 @@ _MOST_REDRAWS: Final = 10_000
 
 def support_of(distribution: Any) -> tuple[float, float]:
     """Lowest and highest possible value; infinite if it is not known."""
-    if isinstance(distribution, Choice):
-        values = list(map(float, distribution.values))
-        return min(values), max(values)
-    if isinstance(distribution, Uniform | LogUniform | Normal):
-        return float(distribution.low), float(distribution.high)
-    with suppress(Exception):  # no distribution of scipy.stats, or not of single numbers
+    if isinstance(distribution, OWN_DISTRIBUTIONS):
+        own: tuple[float, float] = distribution.support()
+        return own
+    with suppress(Exception):  # of scipy.stats, unless it is not of single numbers
         low, high = map(float, distribution.support())
         return low, high
     return -math.inf, math.inf
@@ -333,7 +350,7 @@ def as_distribution(what: str, value: Any) -> Any:
             f"{what} must be a number or a distribution; a dict needs the key 'distribution', "
             f"{_got(value)}"
         )
-    kind = _KINDS[check_option("distribution", arguments.pop("distribution"), _KINDS)]
+    kind = DISTRIBUTIONS[check_option("distribution", arguments.pop("distribution"), DISTRIBUTIONS)]
     known = [one.name for one in fields(kind) if one.init]
     for name in arguments:
         if name not in known:
@@ -350,7 +367,11 @@ def is_distribution(value: object) -> bool:
     """Whether a value of a config is to be drawn anew at each reset."""
     if value is None or isinstance(value, (float, str, type)):  # quickly: `time` asks it
         return False
-    return isinstance(value, _OURS) or has_method(value, "sample") or has_method(value, "rvs")
+    return (
+        isinstance(value, OWN_DISTRIBUTIONS)
+        or has_method(value, "sample")
+        or has_method(value, "rvs")
+    )
 
 
 def draw(value: Any, rng: np.random.Generator) -> Any:
@@ -366,7 +387,7 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
     Raises:
         ConfigError: If a distribution of the caller's own fails, or draws no finite number.
     """
-    if isinstance(value, _OURS):
+    if isinstance(value, OWN_DISTRIBUTIONS):
         return value.sample(rng)
     if not is_distribution(value):
         return value
@@ -429,10 +450,13 @@ def recipe_of(distribution: Any, convert: Callable[[Any], float]) -> Recipe | No
     Returns:
         The description, or None if only Python can draw from it.
     """
-    if type(distribution) not in _OURS:  # a subclass may have its own sample
+    if type(distribution) not in OWN_DISTRIBUTIONS:  # a subclass may have its own sample
+        return None
+    make = getattr(distribution, "_recipe", None)
+    if make is None:  # only Python draws from it
         return None
     try:
-        recipe: Recipe = distribution._recipe(convert)
+        recipe: Recipe = make(convert)
         for limit in recipe.limits:
             convert(limit)
     except ConfigError:  # some draws may be errors

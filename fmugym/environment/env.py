@@ -15,7 +15,7 @@ import gymnasium
 from gymnasium import logger as gymnasium_logger
 from gymnasium.envs.registration import EnvSpec
 
-from fmugym.checks import check_misplaced, check_seed
+from fmugym.checks import check_seed, refuse_positional
 from fmugym.environment.actions import take_action
 from fmugym.environment.conclusion import Result, conclude, first_observation
 from fmugym.environment.config import EnvConfig
@@ -197,7 +197,7 @@ class FMUEnv(Constructed):
             SimulationError: If the FMU cannot be initialized, the first observation is not finite,
                 or the environment is closed.
         """
-        check_misplaced(misplaced)
+        refuse_positional(misplaced)
         pool = self._open_pool("reset")
         if not self._was_reset:
             prepare_hooks(self)  # the constructor of the class may have changed the spaces

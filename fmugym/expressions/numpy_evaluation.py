@@ -104,7 +104,7 @@ def _operation(graph: Graph, node: Node) -> Callable[..., Any]:
     match node.kind:
         case "row":
             name, *keys = what
-            read = operator.attrgetter(QUANTITIES[name].in_hooks if name in QUANTITIES else name)
+            read = operator.attrgetter(QUANTITIES[name].path if name in QUANTITIES else name)
             return lambda env: reduce(operator.getitem, keys, read(env))
         case "cast":
             return partial(_cast, node.dtype)

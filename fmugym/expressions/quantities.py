@@ -53,8 +53,8 @@ class EpisodeQuantity(NamedTuple):
         return self.dtype.type().item()
 
     @property
-    def in_hooks(self) -> str:
-        """Place of the quantity for functions of an environment."""
+    def path(self) -> str:
+        """Attribute of an environment from which functions in Python read the quantity."""
         return "_episode.outputs" if self.name == "outputs" else self.attribute
 
 

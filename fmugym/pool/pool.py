@@ -258,14 +258,14 @@ class Pool(ABC):
         return False
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
-        """Prepare steps with programs.
+        """Prepare a step with programs before and after it.
 
         Args:
             variables: As for ``reset``.
             parts: As for ``fmugym.pool.native_pool.prepare``.
 
         Returns:
-            The functions that do the steps, and resets where the pool has one of its own.
+            The functions of the step, and of resets where the pool has one of its own.
 
         Raises:
             SimulationError: If the pool does not support it.

@@ -1,4 +1,4 @@
-"""States of instances, as values and on disk, where episodes of later programs find them.
+"""States of instances, as values and on disk, where later runs of Python find them.
 
 The values fit any instance of the same FMU, in any process. The files are in the cache folder: a
 digest, and the bytes that a caller makes of a state. A file that is damaged, too large, or no

@@ -481,9 +481,10 @@ class LogColumns:
         return values
 
     def held(self, variable: Variable, part: PlantLog) -> FloatArray:
-        """The values of an input that hold from each row on, as ``values``.
+        """Values of an input from each row to the next, as ``values``.
 
-        Data of the task have those of the row's time in any log.
+        A log with the inputs before each row has them one row later. Data of the task have those of
+        the row's time in any log.
         """
         values, column = self.values(variable, part), self._from[variable.name][0]
         if not part.inputs_before or self._data.find(column) is not None:

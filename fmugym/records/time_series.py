@@ -193,7 +193,7 @@ class TimeSeries:
         return self.values[:, names.index(Spellings("column", names).require(name))]
 
     def cells(self) -> list[npt.NDArray[Any]]:
-        """The values of each column in their own type."""
+        """Columns as arrays: int64 for indices and flags, float64 for all others."""
         return [
             values.astype(np.int64) if column.kind in WHOLE else values
             for column, values in zip(self.columns, self.values.T, strict=True)

@@ -234,7 +234,9 @@ _QUOTED: Final = re.compile('"[^"]*"')
 
 
 def read_tables(path: Path) -> Mapping[str, DataTable]:
-    """Read the tables of a file by name. A file that has not changed is read once.
+    """Read a CSV, Parquet, EPW or Modelica file as tables by name; only Modelica's has several.
+
+    A file that has not changed is read once.
 
     Raises:
         ConfigError: If it is no table, or pyarrow is missing.

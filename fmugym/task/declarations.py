@@ -268,7 +268,7 @@ class Declarations:
                 return section[name].limits
         return self.variables[name].limits
 
-    def agent(self, key: str) -> Entry:
+    def agent_entry(self, key: str) -> Entry:
         """The entry of a key of the agent.
 
         Raises:
@@ -279,7 +279,7 @@ class Declarations:
     @property
     def rescales(self) -> bool:
         """Whether actions go from -1 to 1."""
-        return bool(self.agent("rescale").value) and not self.is_physical
+        return bool(self.agent_entry("rescale").value) and not self.is_physical
 
     def range_of(self, variable: TaskVariable) -> Limits:
         """The lowest and the highest number of an action, in the form of the actions."""
@@ -290,7 +290,7 @@ class Declarations:
     @property
     def normalization(self) -> str | None:
         """Divisor of observations: ``"limits"`` or ``"nominal"``; None for no normalization."""
-        kind = self.agent("normalize").value
+        kind = self.agent_entry("normalize").value
         if self.is_physical or not kind:
             return None
         return "limits" if kind is True else str(kind)

@@ -238,7 +238,7 @@ class _Past:
 
     @property
     def memories(self) -> list[History]:
-        """Readings of sensors with a memory, which are updated after the histories."""
+        """Variables that keep what sensors with a memory read; updated after the histories."""
         return list(self._measured.values())
 
     def _true(self, entry: Entry, name: str, ago: int) -> Value:

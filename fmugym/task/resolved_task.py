@@ -301,7 +301,7 @@ class ResolvedTask:
         for name, (variable, _) in declared.inputs.items():
             values.append(variable.conversion.inverse(self._input_value(name)))
         if not values:
-            raise declared.agent("actions").error(
+            raise declared.agent_entry("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
             )
         return values

@@ -107,13 +107,13 @@ IDEAL: Final = Device()
 
 
 def noise_in(count: Value, channel: int) -> Value:
-    """A number of the standard normal distribution for each step; see ``mathematics.noise``."""
+    """A number of the standard normal distribution for each step; see ``functions.noise``."""
     value: Value = noise(Value.read(count.graph, "variables", NOISE), count, channel)
     return value
 
 
 def chance_in(count: Value, channel: int) -> Value:
-    """A number from 0 to 1 for each step, all as likely; see ``mathematics.noise``."""
+    """A number from 0 to 1 for each step, all as likely; see ``functions.noise``."""
     value: Value = chance(Value.read(count.graph, "variables", NOISE), count, channel)
     return value
 

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.checks import Spellings, check_mapping, check_path, require_regular
-from fmugym.environment.distributions import Choice, LogUniform, Normal, Uniform
+from fmugym.environment.distributions import OWN_DISTRIBUTIONS
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
 from fmugym.keys import Entries, Mistake, checked_entry, found_mistakes, with_paths
 from fmugym.task.data_tables import is_column, with_tables
@@ -413,7 +413,7 @@ def _plain(value: Any) -> Any:
     """The value in types that a file can hold, as far as that is possible."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items() if item is not None}
-    if isinstance(value, Uniform | LogUniform | Normal | Choice):
+    if isinstance(value, OWN_DISTRIBUTIONS):
         return _plain(asdict(value))
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]

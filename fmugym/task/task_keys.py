@@ -23,7 +23,7 @@ from fmugym.checks import (
     integer_of,
 )
 from fmugym.environment.config import CONFIG, EXPRESSION, FOREIGN
-from fmugym.environment.distributions import Choice, Normal, Uniform, is_distribution
+from fmugym.environment.distributions import DISTRIBUTIONS, Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown
 from fmugym.expressions.language import Expression
 from fmugym.fmi.systems.components import Component
@@ -235,7 +235,7 @@ _TIME: Final = {"title": "time", "type": ["number", "string"]}
 _DISTRIBUTION: Final = {
     "type": "object",
     "required": ["distribution"],
-    "properties": {"distribution": {"enum": ["uniform", "log_uniform", "normal", "choice"]}},
+    "properties": {"distribution": {"enum": [*DISTRIBUTIONS]}},
 }
 _DRAWN: Final = {"title": "number, distribution", "anyOf": [_NUMERIC, _DISTRIBUTION]}
 _NUMBERS: Final = {"title": "list of numbers", "type": "array", "items": _NUMERIC}

@@ -108,7 +108,11 @@ class Naming:
         if not self._firsts:
             text = "the task reads no variable of the FMU"
             is_known = declared.root.mistakes.explain(())  # by any mistake
-            raise ConsequenceError(text) if is_known else declared.agent("observations").error(text)
+            raise (
+                ConsequenceError(text)
+                if is_known
+                else declared.agent_entry("observations").error(text)
+            )
         return (outputs, self._firsts[len(outputs) :]) if outputs else (self._firsts, [])
 
     def _find_places(self, names: list[str]) -> dict[str, int]:

@@ -32,7 +32,7 @@ __all__ = [
     "NAMING",
     "TaskVariable",
     "TaskVariables",
-    "check_controller",
+    "check_items_of_controller",
     "check_levels",
     "check_written",
     "declared_start",
@@ -439,7 +439,7 @@ def check_levels(variable: TaskVariable) -> None:
             checked_value(own, whole if math.isclose(number, whole, rel_tol=1e-12) else number)
 
 
-def check_controller(entry: Entry, variable: TaskVariable, controller: Controller) -> None:
+def check_items_of_controller(entry: Entry, variable: TaskVariable, controller: Controller) -> None:
     """Check the numbers that a controller of a warm-up writes to an Enumeration.
 
     Raises:

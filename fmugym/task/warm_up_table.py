@@ -10,7 +10,7 @@ from fmugym.checks import Spellings, check_text, normal_form, number_of
 from fmugym.errors import ConsequenceError, shown, unknown_name
 from fmugym.expressions.language import Expression
 from fmugym.task.entries import Entry
-from fmugym.task.task_variables import TaskVariable, check_controller
+from fmugym.task.task_variables import TaskVariable, check_items_of_controller
 
 if TYPE_CHECKING:
     from fmugym.control import Controller, ControllerTable, Signal
@@ -88,7 +88,7 @@ def read_warm_up(
                 else _acting(one, known)
             )
             _rename(controller, name_of)
-            check_controller(one, variable, controller)
+            check_items_of_controller(one, variable, controller)
             found[variable.alias] = controller
     controllers = None
     if found and len(found) == len(given):

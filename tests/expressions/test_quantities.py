@@ -59,7 +59,7 @@ def test_of_one_environment(load, hooks):
     while not terminated:
         *_, terminated, _, info = env.step(env.action_space.sample())
         for name, term in info["reward_terms"].items():
-            value = operator.attrgetter(QUANTITIES[name].in_hooks)(env)
+            value = operator.attrgetter(QUANTITIES[name].path)(env)
             assert term == (value[KEYS[name]] if name in KEYS else value), name
         angles.add(info["reward_terms"]["previous_outputs"])
     assert len(angles) == 19

@@ -126,7 +126,7 @@ class _Data:
     ) -> tuple[Terms, list[FloatArray]]:
         """The terms, and for each penalty the weights, shape (f, k)."""
         rows, changes = self._matrices(form, courses)
-        terms = Terms.of(form, rows, self.widths)
+        terms = Terms.fitted_to(form, rows, self.widths)
         values = terms.values(rows)
         found = np.zeros((len(penalties), len(values), len(self.size)))
         for place, change in enumerate(changes.T):
@@ -164,7 +164,7 @@ class _Data:
         """The threshold of an input that explains most of a step, beside linear terms."""
         small = replace(form, tanhs=0, quadratic=False)
         rows, changes = self._matrices(small, self.all)
-        terms = Terms.of(small, rows, self.widths)
+        terms = Terms.fitted_to(small, rows, self.widths)
         values = terms.values(rows)
         linear = values[: 1 + terms.factor_count]
         best = np.inf, 0, 0.0

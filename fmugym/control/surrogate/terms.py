@@ -106,8 +106,8 @@ class Terms:
     pairs: Any = field(init=False)
 
     @classmethod
-    def of(cls, form: SurrogateForm, rows: FloatArray, widths: tuple[int, int]) -> Terms:
-        """The terms, scaled by rows as ``regressors_of`` gives them."""
+    def fitted_to(cls, form: SurrogateForm, rows: FloatArray, widths: tuple[int, int]) -> Terms:
+        """Make the terms of a form, with the scales and ranges of rows of ``regressors_of``."""
         low, high = rows.min(axis=1), rows.max(axis=1)
         beyond = _BEYOND * (high - low)
         deviation = rows.std(axis=1)

@@ -241,7 +241,7 @@ static void {name}_network(const {kind} *features, {kind} *given) {{"""
 def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:
     kind = C_TYPES[letter]
     arrays = ["features", *(f"values_{i}" for i in range(len(network.layers) - 1)), "given"]
-    widths = [network.width, *(len(layer.bias) for layer in network.layers)]
+    widths = [network.input_count, *(len(layer.bias) for layer in network.layers)]
     for array, width in zip(arrays[1:-1], widths[1:-1], strict=True):
         yield f"    {kind} {array}[{width}];"
     yield ""

@@ -134,7 +134,7 @@ class Network:
             )
 
     @property
-    def width(self) -> int:
+    def input_count(self) -> int:
         """Number of inputs of the network."""
         return int(self.layers[0].weights.shape[1])
 
@@ -150,10 +150,10 @@ class Network:
 
     def require_fitting(self, count: int, space: spaces.Space[Any]) -> None:
         """Refuse a task that gives another number of values, or has other actions."""
-        if self.width != count:
+        if self.input_count != count:
             raise ConfigError(
-                f"the agent is for another task: its network takes {self.width} values, the task "
-                f"gives {count}"
+                f"the agent is for another task: its network takes {self.input_count} values, "
+                f"the task gives {count}"
             )
         if self.space != space:
             raise ConfigError(

@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.checks import check_count, check_misplaced
+from fmugym.checks import check_count, refuse_positional
 from fmugym.environment.construction import prepare_hooks, require_construction
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.episode_limit import EpisodeLimit
@@ -197,7 +197,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
-        check_misplaced(misplaced)
+        refuse_positional(misplaced)
         if self.closed or self._background.is_pending:
             require_open(self, "reset")
         if seed is None and self.episodes.is_ready:

@@ -126,7 +126,7 @@ class TestPrograms:
         rng = np.random.default_rng(1)
         given = Course(rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2)))
         rows = regressors_of(form, given)
-        terms = Terms.of(form, rows, (2, 2))
+        terms = Terms.fitted_to(form, rows, (2, 2))
         rows = np.ascontiguousarray(1.5 * rows)  # some of them are outside of the range
         weights = rng.normal(size=(2, terms.count))
         low, high = np.array([-1.0, -2.0]), np.array([1.0, 2.0])
@@ -213,7 +213,7 @@ def fit_with(terms, surrogate):
     """A surrogate of other terms, whose weights are 0."""
     width = (1 + terms.form.lags) * sum(terms.widths)
     rows = np.random.default_rng(0).normal(size=(width, 9))
-    terms = Terms.of(terms.form, rows, terms.widths)
+    terms = Terms.fitted_to(terms.form, rows, terms.widths)
     return replace(surrogate, terms=terms, weights=np.zeros((terms.widths[0], terms.count)))
 
 
