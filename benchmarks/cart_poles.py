@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode
 from measure import MissingError, Run, Sample, Stopwatch, repeated
 
 import fmugym
-from fmugym.pool.extension import require_engine
+from fmugym.pool.c_extension import require_engine
 
 __all__ = [
     "FMUGYM",

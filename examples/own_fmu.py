@@ -15,7 +15,7 @@ import numpy as np
 
 import fmugym
 from fmugym import FMI2CSEnv, Uniform
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 
 FMU_PATH = fmugym.bundled_fmu("Pendulum")  # a relative path is relative to this file
 

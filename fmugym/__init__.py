@@ -72,14 +72,14 @@ __all__ = [
 _MODULES = {
     "environment.distributions": ["Choice", "LogUniform", "Normal", "Uniform"],
     "environment.env": [
-        *("FMI1CSEnv", "FMI2CSEnv", "FMI3CSEnv", "FMUEnv"),
-        *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
+        *("FMI1CSEnv", "FMI1MEEnv", "FMI2CSEnv", "FMI2MEEnv"),
+        *("FMI3CSEnv", "FMI3MEEnv", "FMUEnv"),
     ],
     "environment.snapshots": ["Snapshot"],
     "environment.vector": ["FMUVectorEnv"],
     "errors": [
-        *("ConfigError", "ContractError", "FMUGymError"),
-        *("FMULoadError", "LicenceError", "SimulationError", "TaskError"),
+        *("ConfigError", "ContractError", "FMUGymError", "FMULoadError"),
+        *("LicenceError", "SimulationError", "TaskError"),
     ],
     "fmi.bundled": ["bundled_fmu"],
     "fmi.fmu": ["FMU"],
@@ -87,8 +87,8 @@ _MODULES = {
     "task": ["Task", "TaskEnv", "load"],
 }
 _ROOMS = [
-    *("checks", "cli", "control", "deployment", "environment", "envs", "errors", "fmi", "lab"),
-    *("pool", "records", "registration", "rendering", "task", "training"),
+    *("checks", "cli", "control", "deployment", "environment", "envs", "errors", "fmi"),
+    *("lab", "pool", "records", "registration", "rendering", "task", "training"),
 ]
 """Modules and packages that ``fmugym.name`` imports."""
 

@@ -13,7 +13,7 @@
     ├── FMULoadError      an archive, a model description or a library cannot be used
     ├── SimulationError   an FMI call failed, or a method was called out of order
     │   └── LicenceError  an FMU got no licence; it is a ``FMULoadError``, too
-    └── ContractError     ``fmugym.environment.testing`` found an environment that breaks its
+    └── ContractError     ``fmugym.environment.env_checker`` found an environment that breaks its
     contract
 
 Every error takes one argument, its text, and so survives pickling between processes. The text is

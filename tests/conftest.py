@@ -21,7 +21,7 @@ import fmugym
 from fmugym.cli.command_line import run_command_line
 from fmugym.errors import ConfigError
 from fmugym.fmi.wine import Wine
-from fmugym.pool.extension import require_engine
+from fmugym.pool.c_extension import require_engine
 
 sys.path += [folder for folder in building.FOLDERS if folder not in sys.path]
 

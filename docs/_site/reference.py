@@ -42,7 +42,7 @@ MODULES: Final = {
     "Fits to plant logs": "fmugym.records.log_fit",
     "Minari": "fmugym.records.minari",
     "Export": "fmugym.deployment.export",
-    "Checks of an environment": "fmugym.environment.testing",
+    "Checks of an environment": "fmugym.environment.env_checker",
     "Identification": "fmugym.control.identification",
     "Pictures": "fmugym.rendering",
 }

@@ -24,7 +24,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.fmi.variable import Variable, checked_value
 from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.pool import FloatArray, Pool
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = ["TOLERANCE", "OutputTrajectory", "Replay", "error_of", "substeps_of"]
 

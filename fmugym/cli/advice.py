@@ -22,7 +22,7 @@ from fmugym.errors import FMUGymError, plain
 from fmugym.fmi.fmu import FMU
 from fmugym.fmi.variable import Variable
 from fmugym.pool.pool import FloatArray
-from fmugym.pool.spec import FIXED_STEP_SOLVERS
+from fmugym.pool.pool_spec import FIXED_STEP_SOLVERS
 from fmugym.pool.trial.verdict import known_verdict
 
 __all__ = ["Advice", "CheckResult", "ValidationReport", "advise", "advise_episodes", "lines_of"]

@@ -79,7 +79,7 @@ import logging
 from typing import Any
 
 {import_}import fmugym
-from fmugym.environment.testing import check_fmu_env, check_hooks
+from fmugym.environment.env_checker import check_fmu_env, check_hooks
 
 FMU_PATH = {path}  # a relative path is relative to this file
 

@@ -44,7 +44,7 @@ from fmugym.cli.options import (
     watched,
 )
 from fmugym.cli.plant_commands import add_of_plants, evaluate_log, follow_plant, plant_task
-from fmugym.cli.targets import maker_of, player_maker, scenarios_of
+from fmugym.cli.task_arguments import maker_of, player_maker, scenarios_of
 from fmugym.control.candidate_evaluation import most_steps_of
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.vector import FMUVectorEnv

@@ -17,7 +17,7 @@ from fmugym.cli.options import (
     say_result,
     tell,
 )
-from fmugym.cli.targets import maker_of
+from fmugym.cli.task_arguments import maker_of
 from fmugym.control import controller_of
 from fmugym.control.controller_table import acting_text
 from fmugym.control.surrogate.surrogate_fit import plot_prediction, predicted

@@ -22,7 +22,7 @@ from fmugym.cli.options import (
     write_extension,
 )
 from fmugym.cli.overview import finite_or_none
-from fmugym.cli.targets import maker_of
+from fmugym.cli.task_arguments import maker_of
 from fmugym.control.identification import FitResult, plot_comparison
 from fmugym.control.identification.output_error import Shift, shift_of_clocks
 from fmugym.errors import ConfigError, shown

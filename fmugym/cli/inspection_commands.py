@@ -37,7 +37,7 @@ from fmugym.cli.overview import (
     overview,
     overview_of_system,
 )
-from fmugym.cli.targets import maker_of
+from fmugym.cli.task_arguments import maker_of
 from fmugym.cli.task_proposal import Proposal, preload_line
 from fmugym.cli.validation import validate
 from fmugym.errors import ConfigError, FMUGymError, plain, reason
@@ -48,8 +48,8 @@ from fmugym.fmi.systems import FMUSystem
 from fmugym.task import Task, load
 from fmugym.task.data_rows import DataRows, read_rows, standard_time, usual_distance
 from fmugym.task.dates import offset_text
-from fmugym.task.entries import Entry
 from fmugym.task.scenarios import files_of
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_keys import SCHEMA
 from fmugym.training.search.suggested_controllers import controllers_for
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.cli.options import MINARI, only_player, say_result
-from fmugym.cli.targets import maker_of
+from fmugym.cli.task_arguments import maker_of
 from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, FMULoadError, plain
-from fmugym.fmi.dependencies import missing_tool, note_on
 from fmugym.fmi.fmu import FMU
+from fmugym.fmi.library_dependencies import missing_tool, note_on
 from fmugym.fmi.systems import FMUSystem
 from fmugym.fmi.variable import Variable
 from fmugym.pool.opening import Execution, PoolOptions
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 from fmugym.pool.trial.verdict import MOST_INSTANCES, Verdict, known_verdict
 from fmugym.records.evaluation import aligned
 from fmugym.records.recorded_quantities import matches

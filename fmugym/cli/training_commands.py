@@ -29,7 +29,7 @@ from fmugym.cli.options import (
     watched,
     write_extension,
 )
-from fmugym.cli.targets import maker_of, player_maker, scenarios_of
+from fmugym.cli.task_arguments import maker_of, player_maker, scenarios_of
 from fmugym.control import Tuning, tune
 from fmugym.control.controller_parsing import TunableController, search_of
 from fmugym.control.controller_table import is_table, table_in

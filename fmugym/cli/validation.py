@@ -1,7 +1,7 @@
 """Validation of a task: checks of an environment, with cures.
 
-Unlike ``fmugym.environment.testing``, which checks that a class keeps the contract of environments,
-these checks look for tasks that run but cannot be learned.
+Unlike ``fmugym.environment.env_checker``, which checks that a class keeps the contract of
+environments, these checks look for tasks that run but cannot be learned.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from fmugym.environment.vector import FMUVectorEnv
 from fmugym.environment.vector.hook_check import CURE, find_difference, own_hooks
 from fmugym.environment.vector.task_choice import hook_of_one, no_arrays
 from fmugym.errors import FMUGymError
+from fmugym.pool.failure_texts import asked_for
 from fmugym.pool.pool import FloatArray
-from fmugym.pool.reports import asked_for
 from fmugym.pool.trial.verdict import known_verdict
 from fmugym.records.players import action_of
 from fmugym.records.recorded_quantities import quantities_of

@@ -15,8 +15,8 @@ from fmugym.control.controller import Controller
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.vector import FMUVectorEnv
 from fmugym.errors import FMUGymError
+from fmugym.pool.machine_limits import available_processors
 from fmugym.pool.pool import FloatArray
-from fmugym.pool.processors import available_processors
 from fmugym.pool.states import IndexArray
 
 __all__ = [

@@ -46,7 +46,7 @@ from fmugym.keys import (
     or_none,
     table_of_fields,
 )
-from fmugym.pool.spec import (
+from fmugym.pool.pool_spec import (
     DEFAULT_CALL_TIMEOUT,
     DEFAULT_LEAK_LIMIT,
     ISOLATIONS,

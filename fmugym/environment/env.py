@@ -17,7 +17,6 @@ from gymnasium.envs.registration import EnvSpec
 
 from fmugym.checks import check_seed, refuse_positional
 from fmugym.environment.actions import take_action
-from fmugym.environment.conclusion import Result, conclude, first_observation
 from fmugym.environment.config import EnvConfig
 from fmugym.environment.construction import Constructed, draws_of_reset, prepare_hooks
 from fmugym.environment.episode import Episode
@@ -28,6 +27,7 @@ from fmugym.environment.pictures import note_for_picture
 from fmugym.environment.reset import FIRST, EpisodeReset
 from fmugym.environment.saved_episode import columns_of, place_columns, require_saving, scope_of
 from fmugym.environment.snapshots import Snapshot, checked_snapshot
+from fmugym.environment.step_result import Result, conclude, first_observation
 from fmugym.errors import (
     ConfigError,
     SimulationError,
@@ -127,9 +127,9 @@ class FMUEnv(Constructed):
     """Whether the hooks of this class body work on the arrays of N environments.
 
     What a hook reads then has the environments on its last axis, and so has what it returns;
-    ``fmugym.environment.testing.check_hooks`` finds out whether they do. A vector environment calls
-    them once a step, and other hooks once for each environment. A subclass that overrides hooks
-    says it again.
+    ``fmugym.environment.env_checker.check_hooks`` finds out whether they do. A vector environment
+    calls them once a step, and other hooks once for each environment. A subclass that overrides
+    hooks says it again.
     """
 
     steps_after_end: ClassVar[bool] = False

@@ -25,8 +25,8 @@ from fmugym.environment import spaces as fmu_spaces
 from fmugym.environment.actions import InputWriter, elements_of, no_action
 from fmugym.environment.config import EnvConfig
 from fmugym.environment.episode import READABLE, Episode, environments_first, read_by
+from fmugym.environment.hook_results import as_flag, as_reward, finiteness_of
 from fmugym.environment.interface import Interface
-from fmugym.environment.results import as_flag, as_reward, finiteness_of
 from fmugym.environment.value_mappings import NamedValues
 from fmugym.errors import ConfigError, SimulationError
 

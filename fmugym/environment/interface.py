@@ -26,12 +26,7 @@ from fmugym.errors import ConfigError, unknown_name
 from fmugym.expressions.language import Expression
 from fmugym.fmi.description import ModelDescription
 from fmugym.fmi.variable import Variable, with_texts
-from fmugym.pool.spec import (
-    FIXED_STEP_SOLVERS,
-    START_TIME,
-    PoolSpec,
-    whole_number_of_steps,
-)
+from fmugym.pool.pool_spec import FIXED_STEP_SOLVERS, START_TIME, PoolSpec, whole_number_of_steps
 
 __all__ = [
     "Interface",

@@ -17,7 +17,7 @@ from fmugym.environment.snapshots import Columns, Scope, SnapshotColumn, changed
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.expressions.quantities import KEPT, EpisodeQuantity
 from fmugym.pool import Pool
-from fmugym.pool.extension import needs_engine
+from fmugym.pool.c_extension import needs_engine
 
 __all__ = [
     "READ",

@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.extension import require_engine
+from fmugym.pool.c_extension import require_engine
 from fmugym.pool.pool_form import form_of_program
 
 __all__ = [

@@ -31,8 +31,8 @@ from lxml import etree
 
 from fmugym.errors import FMULoadError, reason
 from fmugym.files import cache_folder, read_file, replace_file
-from fmugym.fmi.conversion import convert
 from fmugym.fmi.description import Capabilities, ModelDescription, ModelExchange, Unit
+from fmugym.fmi.fmpy_conversion import convert
 from fmugym.fmi.safe_zip import ArchiveLimits, SafeZip, check_limit
 from fmugym.fmi.variable import OWN, UNKNOWN, Interval, Variable
 

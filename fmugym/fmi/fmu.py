@@ -31,7 +31,9 @@ from fmugym.files import is_own
 from fmugym.fmi import loader
 from fmugym.fmi.binaries import check_library
 from fmugym.fmi.bundled import is_bundled
-from fmugym.fmi.dependencies import (
+from fmugym.fmi.description import INTERFACES, Feedthrough, read_feedthrough
+from fmugym.fmi.description_reader import read_model_description, read_root
+from fmugym.fmi.library_dependencies import (
     ask_in_a_child,
     calls_python,
     describe_missing,
@@ -39,8 +41,6 @@ from fmugym.fmi.dependencies import (
     missing_libraries,
     stray_libraries,
 )
-from fmugym.fmi.description import INTERFACES, Feedthrough, read_feedthrough
-from fmugym.fmi.description_reader import read_model_description, read_root
 from fmugym.fmi.safe_zip import ArchiveLimits, SafeZip
 from fmugym.fmi.temporary import folder_name, make_folder, remove_folder
 from fmugym.fmi.variable import Variable

@@ -20,8 +20,8 @@ from typing import Final
 from fmugym.errors import ConfigError, FMULoadError
 from fmugym.extras import c_compiler
 from fmugym.fmi.binaries import opened
-from fmugym.fmi.dependencies import libraries_of
 from fmugym.fmi.fmu import FMU
+from fmugym.fmi.library_dependencies import libraries_of
 
 __all__ = ["LIBRARIES", "StandIn", "build_stand_in", "replaceable"]
 

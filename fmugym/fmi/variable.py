@@ -53,7 +53,7 @@ _KINDS = {
     "String": "string",
     "Binary": "binary",
     "Clock": "boolean",
-    "StartTime": "real",  # no type of FMI; see ``fmugym.pool.spec.START_TIME``
+    "StartTime": "real",  # no type of FMI; see ``fmugym.pool.pool_spec.START_TIME``
 }
 _INTEGERS = {"Integer": "int32", "Enumeration": "int64"}
 """The types that numpy calls otherwise."""
@@ -141,7 +141,7 @@ class Variable:
         bounds: The limits that a task gives in the place of minimum and maximum; None if it gives
             none.
         sampling: What a step of a task gives of the values after each substep, one of
-            ``fmugym.pool.spec.SAMPLINGS``.
+            ``fmugym.pool.pool_spec.SAMPLINGS``.
     """
 
     name: str

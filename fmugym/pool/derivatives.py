@@ -14,7 +14,7 @@ from fmugym.fmi.systems.system_layout import Route, SystemLayout
 from fmugym.fmi.variable import Variable
 from fmugym.pool.pool import FloatArray
 from fmugym.pool.pool_form import table_of
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = ["Variables", "chained_jacobian", "differentiated"]
 

@@ -21,11 +21,11 @@ from fmugym.errors import SimulationError, first_of
 from fmugym.fmi.description import ModelDescription
 from fmugym.fmi.variable import Variable
 from fmugym.pool.derivatives import Variables, differentiated
+from fmugym.pool.failure_texts import Failure, describe_failure
 from fmugym.pool.pool import FloatArray
 from fmugym.pool.pool_form import BLANK, FLOAT64, INTEGER, Writer, table_of
-from fmugym.pool.reports import Failure, describe_failure
+from fmugym.pool.pool_spec import PoolSpec
 from fmugym.pool.saving_pool import SavingPool
-from fmugym.pool.spec import PoolSpec
 from fmugym.pool.states import NO_SNAPSHOT, SIZE_OF_HEAD, IndexArray
 
 __all__ = [

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from fmugym.fmi.status import Status
 from fmugym.pool.pool import FloatArray, MaskArray, Pool, StatusArray
-from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.pool_spec import PoolSpec, ResetMethod
 
 __all__ = [
     "HEALTH",

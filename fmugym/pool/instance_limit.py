@@ -14,7 +14,7 @@ from typing import Final
 
 from fmugym.errors import LicenceError
 from fmugym.fmi.fmu import FMU
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = ["claim_instances"]
 

@@ -26,6 +26,7 @@ from fmugym import _native
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.fmu import FMU, copy_libraries, extracted_again
 from fmugym.fmi.variable import Variable
+from fmugym.pool.c_extension import require_refusal
 from fmugym.pool.engine import (
     Answer,
     Answers,
@@ -35,7 +36,7 @@ from fmugym.pool.engine import (
     request_restore,
     request_save,
 )
-from fmugym.pool.extension import require_refusal
+from fmugym.pool.failure_texts import FRESH_PROCESSES, REFUSED_ANEW, Receiver, loading_failed
 from fmugym.pool.health import new_arrays, no_counts
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.play_form import Rows, form_of_play
@@ -56,7 +57,6 @@ from fmugym.pool.pool_form import (
     form_of_programs,
     manner_of,
 )
-from fmugym.pool.reports import FRESH_PROCESSES, REFUSED_ANEW, Receiver, loading_failed
 from fmugym.pool.saving_pool import keeps_records
 from fmugym.pool.states import IndexArray
 

@@ -24,16 +24,16 @@ from fmugym.checks import check_option
 from fmugym.errors import ConfigError, FMULoadError, first_of, printable, warn_once
 from fmugym.fmi.fmu import FMU
 from fmugym.fmi.wine import Wine
-from fmugym.pool.extension import has_native_pool, needs_engine, require_engine
+from fmugym.pool.c_extension import has_native_pool, needs_engine, require_engine
 from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.licences import licence_errors, progress, wait_for_licence
+from fmugym.pool.machine_limits import available_processors
 from fmugym.pool.pool import Pool
+from fmugym.pool.pool_spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.pool.processes.process_pool import ProcessPool
-from fmugym.pool.processors import available_processors
 from fmugym.pool.rig.fmpy_pool import fmpy_pool
 from fmugym.pool.rig.rig_pool import BackendPool
 from fmugym.pool.saving_pool import SavingPool, offered_method
-from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.pool.states import SaveMethod
 from fmugym.pool.trial.trial import compare, examine, saving_method
 from fmugym.pool.trial.trial_episodes import Starts

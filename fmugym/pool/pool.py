@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from fmugym.errors import SimulationError
 from fmugym.fmi.variable import Variable
-from fmugym.pool.processors import available_processors
-from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
+from fmugym.pool.machine_limits import available_processors
+from fmugym.pool.pool_spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
 from fmugym.pool.states import Bundle, IndexArray, SaveMethod
 
 __all__ = [
@@ -112,7 +112,8 @@ class Pool(ABC):
 
         Args:
             variables: The variables to set before initialization, P of them; all numeric.
-                ``START_TIME`` of ``fmugym.pool.spec`` stands for the first communication point.
+                ``START_TIME`` of ``fmugym.pool.pool_spec`` stands for the first communication
+                point.
             values: Their values, shape (P, N); only the columns in the mask are used.
             mask: Which instances to start anew, shape (N,); None for all.
 

@@ -28,13 +28,7 @@ from fmugym.fmi.systems.system_layout import PartLayout, SystemLayout, array_key
 from fmugym.fmi.systems.system_plan import Loop
 from fmugym.fmi.variable import Variable, texts_of, unlisted
 from fmugym.fmi.wine import windows_path, windows_uri
-from fmugym.pool.spec import (
-    DEFAULT_TOLERANCE,
-    SAMPLINGS,
-    PoolSpec,
-    ResetMethod,
-    is_start_time,
-)
+from fmugym.pool.pool_spec import DEFAULT_TOLERANCE, SAMPLINGS, PoolSpec, ResetMethod, is_start_time
 
 __all__ = [
     "BLANK",

@@ -24,7 +24,7 @@ from fmugym.fmi.variable import Variable, with_texts
 from fmugym.pool.licences import RetryingPool
 from fmugym.pool.pool import FloatArray, MaskArray, StatusArray
 from fmugym.pool.pool_form import START_TIME_TYPE, table_of, type_number
-from fmugym.pool.spec import START_TIME, PoolSpec, ResetMethod
+from fmugym.pool.pool_spec import START_TIME, PoolSpec, ResetMethod
 from fmugym.pool.states import (
     Bundle,
     Copies,

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.files import read_file, replace_file
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = [
     "MOST_BYTES",

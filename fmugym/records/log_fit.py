@@ -30,7 +30,7 @@ from fmugym.environment.fmu_variables import start_variable
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.fmi.units import conversion_of
 from fmugym.fmi.variable import Variable, values_by_name
-from fmugym.pool.spec import is_start_time
+from fmugym.pool.pool_spec import is_start_time
 from fmugym.records.plant_log import LogColumns, PlantLog, declared_as
 
 __all__ = ["fit_logs", "write_rows"]

@@ -41,8 +41,8 @@ from fmugym.task.data_files import read_tables
 from fmugym.task.data_rows import standard_time, usual_distance
 from fmugym.task.data_tables import DataColumn, DataTable
 from fmugym.task.dates import HOUR, LOCAL_TIME_ADVICE, YEAR, zone_of
-from fmugym.task.entries import Entry
 from fmugym.task.series import read_data
+from fmugym.task.task_entries import Entry
 
 __all__ = [
     "Actions",

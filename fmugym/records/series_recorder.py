@@ -16,7 +16,7 @@ from fmugym.environment.env import FMUEnv, inner_env
 from fmugym.environment.vector import FMUVectorEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.pool import FloatArray, MaskArray, Pool
-from fmugym.pool.spec import whole_number_of_steps
+from fmugym.pool.pool_spec import whole_number_of_steps
 from fmugym.records.recorded_quantities import (
     Infos,
     RecordedEnvs,

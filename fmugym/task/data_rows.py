@@ -29,8 +29,8 @@ from fmugym.task.dates import (
     offset_text,
     standard_offset,
 )
-from fmugym.task.entries import Entry
 from fmugym.task.scenarios import files_of
+from fmugym.task.task_entries import Entry
 
 __all__ = [
     "DataRows",

@@ -23,11 +23,11 @@ from fmugym.fmi.description import ModelDescription
 from fmugym.fmi.units import IDENTITY
 from fmugym.keys import Table
 from fmugym.task.data_rows import standard_time
-from fmugym.task.entries import Entry
 from fmugym.task.scenarios import chosen_files, file_lists, read_fitted
 from fmugym.task.section_entries import Limits, Term, read_derived, read_kpi, read_memory, read_term
 from fmugym.task.series import read_data
 from fmugym.task.set_points import SetPoints
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_keys import DEVICE, SETPOINT
 from fmugym.task.task_variables import (
     NAMING,

@@ -11,9 +11,9 @@ import numpy as np
 
 from fmugym.expressions.graph import Value, where
 from fmugym.task.declarations import Declarations
-from fmugym.task.entries import Entry, nearest_steps, steps_in
 from fmugym.task.section_entries import Limits
 from fmugym.task.sensors import first_step, noise_in
+from fmugym.task.task_entries import Entry, nearest_steps, steps_in
 from fmugym.task.task_keys import DEVICE
 from fmugym.task.task_names import Moment, Naming, queue_name
 from fmugym.task.task_variables import TaskVariable

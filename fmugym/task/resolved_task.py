@@ -21,7 +21,6 @@ from fmugym.expressions.language import Expression
 from fmugym.expressions.numpy_evaluation import function_of, update_by
 from fmugym.fmi.description import ModelDescription
 from fmugym.task.declarations import Declarations
-from fmugym.task.entries import Entry, steps_in
 from fmugym.task.observations import (
     NoiseKey,
     Seen,
@@ -36,6 +35,7 @@ from fmugym.task.scenarios import held_out_times
 from fmugym.task.section_entries import Kpi, Term, kpi_name
 from fmugym.task.sensors import NOISE
 from fmugym.task.task_config import beginning_of, bounds_of, samplings_of, time_step_of, times_of
+from fmugym.task.task_entries import Entry, steps_in
 from fmugym.task.task_file import Task
 from fmugym.task.task_names import Moment, Naming, switch_names
 from fmugym.task.task_quantities import explanation, named_values

@@ -22,7 +22,7 @@ import numpy as np
 from fmugym.checks import Spellings, require_regular
 from fmugym.environment.distributions import Choice, DrawnColumn
 from fmugym.errors import ConfigError, missing_file, shown, unknown_name
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 
 __all__ = [
     "FileLists",

@@ -13,7 +13,7 @@ import numpy as np
 from fmugym.expressions.functions import maximum, minimum
 from fmugym.expressions.graph import Value, where
 from fmugym.expressions.language import Expression
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_keys import KPI
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.environment.distributions import Normal, is_distribution
 from fmugym.expressions.functions import chance, clip, noise
 from fmugym.expressions.graph import Graph, Value, where
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_keys import DEVICE
 
 __all__ = ["IDEAL", "NOISE", "Device", "chance_in", "first_step", "noise_in", "read_device"]

@@ -14,9 +14,9 @@ from fmugym.errors import ConfigError, shown
 from fmugym.pool.pool import FloatArray
 from fmugym.task.data_rows import read_rows
 from fmugym.task.dates import DAY, YEAR
-from fmugym.task.entries import Entry
 from fmugym.task.scenarios import files_of, variable_of
 from fmugym.task.section_entries import Limits, read_limits
+from fmugym.task.task_entries import Entry
 
 __all__ = ["Series", "read_data", "read_schedule"]
 

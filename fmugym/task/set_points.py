@@ -8,9 +8,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from fmugym.expressions.language import Expression
-from fmugym.task.entries import Entry
 from fmugym.task.section_entries import Derived, Limits, MemoryVariable, read_limits
 from fmugym.task.series import Series, read_schedule
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_keys import RAMP, SETPOINT, SINE, STEPS
 
 __all__ = ["Deviation", "SetPoints", "Steps"]

@@ -7,8 +7,8 @@ from typing import Any
 from fmugym.environment.distributions import is_distribution
 from fmugym.fmi.description import ModelDescription
 from fmugym.task.declarations import Declarations
-from fmugym.task.entries import Entry, steps_in
 from fmugym.task.scenarios import read_begin, read_scenarios
+from fmugym.task.task_entries import Entry, steps_in
 from fmugym.task.task_names import CLOCK, Naming
 
 __all__ = ["beginning_of", "bounds_of", "samplings_of", "time_step_of", "times_of"]

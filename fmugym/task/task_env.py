@@ -14,8 +14,8 @@ import gymnasium
 from fmugym.checks import check_flag
 from fmugym.environment.env import FMUEnv
 from fmugym.errors import ArgumentError, ConfigError, reason, shown, unknown_argument, unknown_name
-from fmugym.task.entries import Entry
 from fmugym.task.resolved_task import ResolvedTask
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_file import Task
 from fmugym.task.task_fmu import described
 

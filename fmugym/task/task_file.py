@@ -21,8 +21,8 @@ from fmugym.environment.distributions import OWN_DISTRIBUTIONS
 from fmugym.errors import ConfigError, missing_file, reason, shown, unknown_name
 from fmugym.keys import Entries, Mistake, checked_entry, found_mistakes, with_paths
 from fmugym.task.data_tables import is_column, with_tables
-from fmugym.task.entries import Entry, Source
 from fmugym.task.scenarios import listed_files, read_scenarios
+from fmugym.task.task_entries import Entry, Source
 from fmugym.task.task_keys import TASK, VERSION
 from fmugym.task.task_writer import as_toml, revised, write_new
 

@@ -17,7 +17,7 @@ from fmugym.fmi.fmu import FMU
 from fmugym.fmi.systems import Component, FMUSystem
 from fmugym.fmi.systems.components import Connection, OpenComponent
 from fmugym.keys import table_of_fields
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_file import Task
 
 __all__ = ["described", "fmu_of"]

@@ -42,9 +42,9 @@ from fmugym.keys import (
     option,
     table_of_fields,
 )
-from fmugym.pool.spec import SAMPLINGS
+from fmugym.pool.pool_spec import SAMPLINGS
 from fmugym.task.dates import moment_of_year, zone_of
-from fmugym.task.entries import constant_of, finite, number, number_or_distribution
+from fmugym.task.task_entries import constant_of, finite, number, number_or_distribution
 
 __all__ = ["AGENT", "DEVICE", "KPI", "PLANT", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
 

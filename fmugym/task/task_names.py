@@ -18,9 +18,9 @@ from fmugym.expressions.graph import Graph, Value, where
 from fmugym.expressions.language import Expression, Names
 from fmugym.fmi.variable import Variable
 from fmugym.task.declarations import BUILT_IN, Declarations
-from fmugym.task.entries import Entry, nearest_steps, steps_in
 from fmugym.task.sensors import chance_in
 from fmugym.task.series import Series
+from fmugym.task.task_entries import Entry, nearest_steps, steps_in
 from fmugym.task.task_variables import TaskVariable
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]

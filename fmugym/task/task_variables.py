@@ -19,9 +19,9 @@ from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
 from fmugym.fmi.description import ModelDescription
 from fmugym.fmi.units import IDENTITY, Conversion, conversion_of
 from fmugym.fmi.variable import Variable, checked_value
-from fmugym.task.entries import Entry, number_or_distribution
 from fmugym.task.section_entries import Limits, read_limits
 from fmugym.task.sensors import IDEAL, Device, read_device
+from fmugym.task.task_entries import Entry, number_or_distribution
 
 if TYPE_CHECKING:
     from fmugym.control import Controller

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from fmugym.checks import Spellings, check_text, normal_form, number_of
 from fmugym.errors import ConsequenceError, shown, unknown_name
 from fmugym.expressions.language import Expression
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 from fmugym.task.task_variables import TaskVariable, check_items_of_controller
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
 from fmugym.files import lasting_folder, replace_file
 from fmugym.task import Task
-from fmugym.training.library_envs import make_vector_env
+from fmugym.training.rl_library_envs import make_vector_env
 
 try:
     import ray

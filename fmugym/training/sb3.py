@@ -25,7 +25,7 @@ from fmugym.environment.vector.vector_env import require_open
 from fmugym.errors import ConfigError
 from fmugym.extras import lacking
 from fmugym.pool.pool import MaskArray
-from fmugym.training.library_envs import make_vector_env, require_vector_env
+from fmugym.training.rl_library_envs import make_vector_env, require_vector_env
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor

@@ -23,7 +23,7 @@ from fmugym.environment.env import FMUEnv
 from fmugym.environment.vector import FMUVectorEnv
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.files import write_whole
-from fmugym.pool.processors import available_memory, available_processors, used_memory
+from fmugym.pool.machine_limits import available_memory, available_processors, used_memory
 from fmugym.records.evaluation import HELD_OUT_SEED, Score, Wrap, evaluate, warning_of_one_reward
 from fmugym.records.players import Player, policy_of_controller
 from fmugym.records.progress_bars import Advance, no_progress

@@ -23,12 +23,12 @@ from fmugym.control.candidate_evaluation import (
     CeilingError,
 )
 from fmugym.control.controller_parsing import plans_ahead, warmed
-from fmugym.control.surrogate.courses import Courses
+from fmugym.control.surrogate.recorded_trajectories import Courses
 from fmugym.control.tuning import NO_MERIT
 from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError, reading_file, reason, shown
 from fmugym.files import replaced_together
-from fmugym.pool.processors import available_processors
+from fmugym.pool.machine_limits import available_processors
 from fmugym.records.episode_statistics import confidence
 from fmugym.records.evaluation import HELD_OUT_SEED
 from fmugym.records.progress_bars import Advance, no_progress
@@ -39,7 +39,7 @@ from fmugym.training.search.policy_search import Search
 from fmugym.training.search.probe import FEW, MOST_PROBED, Probe, agent_task
 from fmugym.training.search.search_file import bytes_of, plain_of, search_in
 from fmugym.training.search.suggested_controllers import MOST_TESTED
-from fmugym.training.search.twin import TwinSearch
+from fmugym.training.search.surrogate_search import TwinSearch
 from fmugym.training.training_records import append_row
 
 __all__ = ["STATE", "Searching", "judge", "verdict"]

@@ -16,7 +16,7 @@
 #include "shared/platform.h"
 
 /* What a step gives of the values that an output has after each of its substeps.
- * fmugym/pool/spec.py lists their names in this order. */
+ * fmugym/pool/pool_spec.py lists their names in this order. */
 typedef enum { SAMPLE_LAST, SAMPLE_MEAN, SAMPLE_INTEGRAL, SAMPLE_MIN, SAMPLE_MAX } Sampling;
 
 /* The settings of a pool. Everything they point to must stay in place as long as the pool

@@ -10,8 +10,8 @@ import fmugym
 from fmugym.control import Controller
 from fmugym.control.candidate_evaluation import CandidateEvaluator
 from fmugym.envs import PendulumEnv
+from fmugym.pool.machine_limits import available_processors
 from fmugym.pool.processes.process_pool import ProcessPool
-from fmugym.pool.processors import available_processors
 
 
 class Constant(Controller):

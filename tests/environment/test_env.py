@@ -13,7 +13,7 @@ from vector_tools import ABSURD, IDS, Cart, Reaching
 
 import fmugym
 from fmugym import Choice, ConfigError, Normal, Uniform
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 from fmugym.fmi.bundled import FMI_VERSIONS
 
 

@@ -11,7 +11,7 @@ from scipy import stats
 import fmugym
 from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform, errors
 from fmugym.environment import fmu_variables
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 
 FMU = fmugym.bundled_fmu("Pendulum")
 FRICTION = "'c'.*0.*inf N.m.*FMU's min and max"

@@ -8,7 +8,7 @@ import pytest
 
 import fmugym
 from fmugym import ConfigError, ContractError
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 
 
 class Sound(fmugym.FMUEnv):

@@ -8,7 +8,7 @@ from fmugym import FMU
 from fmugym.cli.class_skeleton import Skeleton
 from fmugym.cli.command_line import run_command_line
 from fmugym.cli.task_proposal import Proposal
-from fmugym.pool.reports import as_messages, asked_for, quoted
+from fmugym.pool.failure_texts import as_messages, asked_for, quoted
 
 NEEDED = "!stop_defined", "a stop time is needed"
 

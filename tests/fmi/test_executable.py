@@ -15,7 +15,7 @@ from fmu_tools import HERE, edited_fmu, library_name, probe_config, read_fmu
 from fmugym import FMU, FMULoadError, bundled_fmu
 from fmugym.fmi import fmu as fmus
 from fmugym.fmi.binaries import check_library
-from fmugym.fmi.dependencies import missing_libraries
+from fmugym.fmi.library_dependencies import missing_libraries
 
 PENDULUM = read_fmu(bundled_fmu("Pendulum", "3.0"))
 FOLDERS = {

@@ -15,7 +15,7 @@ from process_tools import run_python
 
 from fmugym import FMU, ConfigError, Task, extras
 from fmugym.fmi import stand_in
-from fmugym.fmi.dependencies import ask_in_a_child, missing_libraries
+from fmugym.fmi.library_dependencies import ask_in_a_child, missing_libraries
 from fmugym.fmi.loader import ask
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")

@@ -26,8 +26,8 @@ from fmugym.fmi import wine as windows_worker
 from fmugym.fmi.wine import Wine, can_run_windows
 from fmugym.pool import opening
 from fmugym.pool.opening import PoolOptions
+from fmugym.pool.pool_spec import PoolSpec
 from fmugym.pool.processes.process_pool import ProcessPool
-from fmugym.pool.spec import PoolSpec
 
 if sys.platform != "win32":
     import fcntl

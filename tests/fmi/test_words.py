@@ -12,7 +12,7 @@ from ways import many
 from words_tools import WordsEnv, words_fmu
 
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.pool.reports import as_messages, quoted, telling, unpacked
+from fmugym.pool.failure_texts import as_messages, quoted, telling, unpacked
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 

@@ -35,7 +35,7 @@ from fmugym.fmi.systems.system import SystemFMU
 from fmugym.fmi.systems.system_plan import MASTERS
 from fmugym.pool import PoolSpec
 from fmugym.pool.native_pool import NativePool
-from fmugym.pool.spec import SOLVERS, START_TIME
+from fmugym.pool.pool_spec import SOLVERS, START_TIME
 
 LOG = logging.getLogger("fmugym.test")
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ import pytest
 from process_tools import run_python
 from test_native_pool import NativePool, busy_fmu, make, on_linux
 
-from fmugym.pool.processors import (
+from fmugym.pool.machine_limits import (
     available_memory,
     available_processors,
     processor_quota,
@@ -176,7 +176,7 @@ class TestQuota:
         ],
     )
     def test_of_control_groups(self, tmp_path, monkeypatch, files, expected):
-        monkeypatch.setattr("fmugym.pool.processors._ROOT", self.write(tmp_path, files))
+        monkeypatch.setattr("fmugym.pool.machine_limits._ROOT", self.write(tmp_path, files))
         assert processor_quota() == expected
 
     @pytest.mark.parametrize(
@@ -206,7 +206,7 @@ class TestQuota:
         ],
     )
     def test_memory(self, tmp_path, monkeypatch, files, expected):
-        monkeypatch.setattr("fmugym.pool.processors._ROOT", self.write(tmp_path, files))
+        monkeypatch.setattr("fmugym.pool.machine_limits._ROOT", self.write(tmp_path, files))
         assert available_memory() == expected
 
     @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
@@ -224,7 +224,7 @@ class TestQuota:
 
     @pytest.mark.parametrize(("quota", "expected"), [(np.inf, 8), (3.0, 3), (1.5, 2), (0.1, 1)])
     def test_counts_as_processors_do(self, monkeypatch, quota, expected):
-        name = "fmugym.pool.processors."
+        name = "fmugym.pool.machine_limits."
         monkeypatch.setattr(name + "processor_quota", lambda: quota)
         monkeypatch.setattr(name + "os.sched_getaffinity", lambda _: set(range(8)), raising=False)
         assert available_processors() == expected

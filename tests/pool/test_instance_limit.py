@@ -13,7 +13,7 @@ from fmu_tools import grouped
 import fmugym
 from fmugym.errors import LicenceError
 from fmugym.pool.instance_limit import claim_instances
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 
 class LimitedEnv(fmugym.FMI2CSEnv):

@@ -11,7 +11,7 @@ from process_tools import posix_only
 from fmugym import FMU, FMULoadError, FMUSystem
 from fmugym.pool import PoolSpec
 from fmugym.pool.opening import PoolOptions, open_pool
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.pool_spec import ResetMethod
 
 LOG = logging.getLogger("fmugym.test")
 VARIABLES = (("u", "input", 'start="0"'), ("y", "output", ""))

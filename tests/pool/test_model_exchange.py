@@ -19,7 +19,7 @@ from fmugym.cli.class_skeleton import Skeleton
 from fmugym.cli.task_proposal import Proposal
 from fmugym.control.linearization import linearize
 from fmugym.fmi import Status
-from fmugym.pool.spec import SOLVERS
+from fmugym.pool.pool_spec import SOLVERS
 from fmugym.pool.states import SaveMethod
 
 DERIVATIVES = 'providesDirectionalDerivative="true"'

@@ -6,7 +6,7 @@ from fmu_tools import PlainEnv
 from pool_tools import KINDS, open_pool, start, step
 
 from fmugym import FMU, ConfigError, bundled_fmu
-from fmugym.pool.spec import SAMPLINGS
+from fmugym.pool.pool_spec import SAMPLINGS
 
 SUBSTEPS, STEP = 5, 0.1
 OUTPUTS = ("x", "x_dot", "theta", "theta_dot", "f")

@@ -19,7 +19,7 @@ from ways import in_way
 import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
 from fmugym.errors import TaskError
-from fmugym.pool.spec import START_TIME
+from fmugym.pool.pool_spec import START_TIME
 from fmugym.records import RecordSeries
 
 STEP = 0.25

@@ -22,7 +22,7 @@ from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, Uniform
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 from fmugym.records import RecordSeries
 
 A = np.array([[-1.0, 0.5], [0.0, -2.0]])

@@ -24,7 +24,7 @@ from ways import in_way
 import fmugym
 from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform
 from fmugym.checks import integer_of
-from fmugym.environment import testing
+from fmugym.environment import env_checker
 from fmugym.environment.config import EnvConfig
 from fmugym.fmi import ArchiveLimits
 from fmugym.pool import Paced
@@ -415,8 +415,8 @@ def of_functions(rng):
         "ArchiveLimits": lambda: ArchiveLimits(max_ratio=value),
         "EnvConfig": lambda: EnvConfig.from_dict(value),
         "Paced": lambda: Paced(other, hold_after=value),
-        "check_fmu_env": lambda: testing.check_fmu_env(value),
-        "check_hooks": lambda: callable(value) or testing.check_hooks(value),
+        "check_fmu_env": lambda: env_checker.check_fmu_env(value),
+        "check_hooks": lambda: callable(value) or env_checker.check_hooks(value),
         "register": lambda: register(rng.choice((value, "fuzz/Odd-v0")), other),
     }
     kind = rng.choice(list(calls))

@@ -21,7 +21,7 @@ from system_tools import MATRICES, linear_fmu
 from fmugym import Component, Connection, FMUSystem, SimulationError
 from fmugym.pool import PoolSpec
 from fmugym.pool.native_pool import NativePool
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.states import SaveMethod
 
 LOG = logging.getLogger("fmugym.test")

@@ -47,7 +47,7 @@ from fmugym.expressions.program import TYPES
 from fmugym.pool import PoolSpec
 from fmugym.pool.native_pool import NativePool
 from fmugym.pool.pool_form import form_of_program
-from fmugym.pool.spec import SOLVERS, ResetMethod
+from fmugym.pool.pool_spec import SOLVERS, ResetMethod
 
 THREADS = 6
 LONGEST_WAIT = 120.0

@@ -7,7 +7,7 @@ import fuzz_tasks
 import pytest
 
 from fmugym.errors import TaskError
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 
 
 @pytest.mark.parametrize("task", [fuzz_tasks.PENDULUM, fuzz_tasks.SWITCHED])

@@ -20,7 +20,7 @@ import numpy as np
 from example_tools import EXAMPLES
 
 import fmugym
-from fmugym.cli.targets import maker_of
+from fmugym.cli.task_arguments import maker_of
 from fmugym.records.episode_statistics import confidence
 from fmugym.training.search_training import Searching
 

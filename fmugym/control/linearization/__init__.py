@@ -2,6 +2,6 @@
 
 from fmugym.control.linearization.linear_model import LinearModel, linearize
 from fmugym.control.linearization.linear_trajectory import linearize_along
-from fmugym.control.linearization.sensitivities import derivatives
+from fmugym.control.linearization.trajectory_derivatives import derivatives
 
 __all__ = ["LinearModel", "derivatives", "linearize", "linearize_along"]

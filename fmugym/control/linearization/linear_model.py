@@ -20,8 +20,8 @@ from fmugym.fmi.systems.system_description import SystemDescription
 from fmugym.fmi.variable import Variable, start_of
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.pool import FloatArray, Pool
+from fmugym.pool.pool_spec import PoolSpec
 from fmugym.pool.processes.process_pool import ProcessPool
-from fmugym.pool.spec import PoolSpec
 
 __all__ = ["LinearModel", "linearize"]
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.checks import check_number, check_option
-from fmugym.control.linearization.sensitivities import (
+from fmugym.control.linearization.trajectory_derivatives import (
     Matrices,
     checked_trajectory,
     differences,

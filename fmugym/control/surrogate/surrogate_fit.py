@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.control.surrogate.courses import Course, Courses
+from fmugym.control.surrogate.recorded_trajectories import Course, Courses
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of, simulated
 from fmugym.errors import ConfigError

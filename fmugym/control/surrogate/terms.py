@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.control.surrogate.courses import Course
+from fmugym.control.surrogate.recorded_trajectories import Course
 from fmugym.expressions.graph import Graph, Value, where
 from fmugym.fmi.variable import Variable
 from fmugym.pool.pool import FloatArray

@@ -21,7 +21,7 @@ from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.expressions.graph import Graph, Value, where
 from fmugym.fmi.description import Unit
-from fmugym.pool.spec import is_start_time
+from fmugym.pool.pool_spec import is_start_time
 from fmugym.training.search.policy import ResidualAgent
 
 __all__ = ["ExportedAgent", "agent_of", "agent_of_surrogate", "check_name"]

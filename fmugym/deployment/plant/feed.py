@@ -24,7 +24,7 @@ from fmugym.records.plant_log import declared_as
 from fmugym.task.data_rows import read_rows
 from fmugym.task.dates import moment_of_year
 from fmugym.task.declarations import as_declared
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 
 __all__ = ["Feed", "Live", "forecasts", "horizon"]
 

@@ -14,7 +14,7 @@ from fmugym.fmi.variable import Variable
 from fmugym.records.plant_log import declared_as
 from fmugym.task import TaskEnv
 from fmugym.task.data_rows import standard_time
-from fmugym.task.entries import Entry
+from fmugym.task.task_entries import Entry
 
 __all__ = ["DATA_PREFIX", "Plant", "Tag", "read_plant"]
 

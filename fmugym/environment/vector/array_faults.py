@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmugym.environment.conclusion import not_finite
+from fmugym.environment.step_result import not_finite
 from fmugym.environment.vector import array_results
 from fmugym.environment.vector.array_episodes import ArrayEpisodes
 from fmugym.environment.vector.array_results import (

@@ -20,7 +20,7 @@ from fmugym.checks import check_mapping, number_of
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.episode import environments_first
 from fmugym.environment.episode_start import EpisodeStart
-from fmugym.environment.results import given
+from fmugym.environment.hook_results import given
 from fmugym.environment.spaces import to_input_types
 from fmugym.environment.vector.infos import coded, observation_of, rows_not_finite
 from fmugym.errors import ConfigError, FMUGymError, SimulationError, shown

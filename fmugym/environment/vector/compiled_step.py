@@ -16,10 +16,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.environment.actions import as_element
-from fmugym.environment.conclusion import Result, conclude
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.episode_start import Draw, no_draws
 from fmugym.environment.saved_episode import READ
+from fmugym.environment.step_result import Result, conclude
 from fmugym.environment.vector.infos import masked
 from fmugym.environment.vector.quantity_arrays import (
     EpisodeArrays,
@@ -30,7 +30,7 @@ from fmugym.environment.vector.quantity_arrays import (
 from fmugym.environment.vector.task_programs import TaskPrograms, compile_formulas, formulas_of
 from fmugym.expressions.program import LETTERS, TYPES, Row, UncompilableError
 from fmugym.expressions.quantities import PREVIOUS
-from fmugym.pool.extension import require_refusal
+from fmugym.pool.c_extension import require_refusal
 from fmugym.pool.play_form import ArrayElement, RowStart
 from fmugym.pool.pool import FloatArray, MaskArray, Play
 

@@ -26,7 +26,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.fmi.variable import Variable
 from fmugym.pool import Pool
 from fmugym.pool.pool import FloatArray, MaskArray, StatusArray
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.states import Bundle, IndexArray, SaveMethod
 
 __all__ = ["Episodes", "PoolColumn", "SeparateEpisodes", "attribute"]

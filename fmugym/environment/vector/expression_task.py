@@ -25,7 +25,7 @@ from fmugym.environment.vector.compiled_step import Layout, prepare_step
 from fmugym.environment.vector.infos import add_ends, add_starts
 from fmugym.environment.vector.task_programs import TaskPrograms
 from fmugym.environment.vector.tasks import StepResult, VectorTask
-from fmugym.pool.extension import require_refusal
+from fmugym.pool.c_extension import require_refusal
 from fmugym.pool.licences import require_started
 from fmugym.pool.pool import FloatArray, MaskArray, Played
 from fmugym.pool.states import IndexArray

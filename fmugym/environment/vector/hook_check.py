@@ -20,8 +20,8 @@ from gymnasium import spaces
 from fmugym.environment.actions import flat_inputs
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.episode import Episode, standing_in
+from fmugym.environment.hook_results import as_flag, as_info, as_reward
 from fmugym.environment.hooks import ORDER, Hooks
-from fmugym.environment.results import as_flag, as_info, as_reward
 from fmugym.environment.snapshots import changed, plain_attributes, put_back
 from fmugym.environment.value_mappings import EpisodeVariables, ParameterValues
 from fmugym.environment.vector import array_results

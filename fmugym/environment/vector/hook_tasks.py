@@ -15,13 +15,13 @@ import numpy.typing as npt
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from fmugym.environment.actions import checked_actions, is_array_space, take_action
-from fmugym.environment.conclusion import Result, conclude, first_observation
 from fmugym.environment.construction import draws_of_reset
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.episode import environments_last
 from fmugym.environment.forecasts import assumed, future_of
 from fmugym.environment.hooks import ORDER, Hooks, call_hooks
 from fmugym.environment.pictures import note_for_picture
+from fmugym.environment.step_result import Result, conclude, first_observation
 from fmugym.environment.vector import array_results
 from fmugym.environment.vector.array_faults import settle_faults
 from fmugym.environment.vector.array_results import infos_of_hooks, write_inputs_of_hooks
@@ -168,7 +168,7 @@ class ArrayHooks(Expressions):
         raise ConfigError(
             f"{hook} of {type(self.env).__name__}, whose hooks are said to be vectorized, does "
             f"not work on the arrays of {self._n} environments: {what}. "
-            "fmugym.environment.testing.check_hooks shows what is wrong"
+            "fmugym.environment.env_checker.check_hooks shows what is wrong"
         ) from error
 
     # The form of what hooks return.

@@ -19,7 +19,7 @@ from fmugym.environment.vector.tasks import VectorTask
 from fmugym.errors import ConfigError, warn_once
 from fmugym.expressions.program import UncompilableError
 from fmugym.pool import Pool
-from fmugym.pool.extension import has_native_pool
+from fmugym.pool.c_extension import has_native_pool
 
 __all__ = ["hook_of_one", "make_task", "no_arrays", "require_own_order"]
 
@@ -105,7 +105,7 @@ def _reason(env: FMUEnv) -> str | None:
         key = f"; or give an expression under {_KEYS[hook]!r}" if hook in _KEYS else ""
         return (
             f"one environment at a time, which is slow, because {hook} is not vectorized: let "
-            f"fmugym.environment.testing.check_hooks find out whether they work on arrays, and "
+            f"fmugym.environment.env_checker.check_hooks find out whether they work on arrays, and "
             f"write vectorized = True in the class that has {hook}{key}"
         )
     if not has_native_pool():

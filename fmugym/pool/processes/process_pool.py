@@ -26,6 +26,7 @@ from fmugym.fmi.fmu import FMU, extracted_again
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.fmi.variable import Variable
 from fmugym.pool.engine import Answer, EnginePool, Reader, Request, request_listing, request_restore
+from fmugym.pool.failure_texts import REFUSED_ANEW
 from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.pool import (
@@ -38,12 +39,11 @@ from fmugym.pool.pool import (
     available_processors,
 )
 from fmugym.pool.pool_form import Writer
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.processes.shared_memory import Memory
 from fmugym.pool.processes.supervisor import A_STEP, INTERRUPTED, RESET, Supervisor
 from fmugym.pool.processes.worker_group import StatesOfWorkers, WorkerGroup
 from fmugym.pool.processes.worker_setup import Setup
-from fmugym.pool.reports import REFUSED_ANEW
-from fmugym.pool.spec import ResetMethod
 from fmugym.pool.states import IndexArray
 
 __all__ = ["ProcessPool"]

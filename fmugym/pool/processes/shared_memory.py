@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.health import Arrays, HealthArray, layout_of
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 if sys.platform == "linux":
     import fcntl

@@ -16,14 +16,14 @@ from typing import Any, Final, NamedTuple, NoReturn
 
 from fmugym.errors import FMULoadError, printable
 from fmugym.pool.engine import Answer, Answers, DamagedError, Reader, Request
+from fmugym.pool.failure_texts import MORE_PROCESSES, Receiver, as_messages, loading_failed, quoted
 from fmugym.pool.health import Arrays
+from fmugym.pool.pool_spec import INITIALIZATION_FACTOR
 from fmugym.pool.processes.channel import Channel, LateError, Output, describe_exit, lines_of_echo
 from fmugym.pool.processes.guard import LONGEST_START
 from fmugym.pool.processes.launcher import Process, launch
 from fmugym.pool.processes.shared_memory import BlockCopies, Memory
 from fmugym.pool.processes.worker_setup import Setup
-from fmugym.pool.reports import MORE_PROCESSES, Receiver, as_messages, loading_failed, quoted
-from fmugym.pool.spec import INITIALIZATION_FACTOR
 
 __all__ = [
     "A_STEP",

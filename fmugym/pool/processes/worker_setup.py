@@ -18,10 +18,10 @@ from fmugym.fmi.fmu import FMU, copy_libraries
 from fmugym.fmi.wine import Wine, windows_path
 from fmugym.pool.pool import PoolSpec
 from fmugym.pool.pool_form import Files, Writer, form_of_pool
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.processes.launcher import Order
 from fmugym.pool.processes.shared_memory import ECHO_SIZE, Memory
 from fmugym.pool.saving_pool import keeps_records
-from fmugym.pool.spec import ResetMethod
 
 __all__ = ["Setup"]
 

@@ -37,12 +37,12 @@ from fmugym.errors import ConfigError, FMULoadError, SimulationError
 from fmugym.fmi.fmu import FMU, copy_libraries
 from fmugym.fmi.status import Status, failed_call, sane
 from fmugym.fmi.variable import Variable
-from fmugym.pool.extension import needs_engine
+from fmugym.pool.c_extension import needs_engine
+from fmugym.pool.failure_texts import Message, as_log_record, quoted
 from fmugym.pool.licences import licence_errors
-from fmugym.pool.reports import Message, as_log_record, quoted
+from fmugym.pool.pool_spec import START_TIME, PoolSpec
 from fmugym.pool.rig.rig import FaultError
 from fmugym.pool.rig.rig_pool import BackendPool
-from fmugym.pool.spec import START_TIME, PoolSpec
 
 __all__ = [
     "FMPyInstance",

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import Status
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = ["Backend", "FaultError", "Outcome", "Outputs", "Rig", "describe_error"]
 

@@ -18,13 +18,13 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.fmu import FMU
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.fmi.variable import Variable, values_by_name
-from fmugym.pool.extension import needs_engine
+from fmugym.pool.c_extension import needs_engine
 from fmugym.pool.health import Column, CountedPool, new_arrays, note
 from fmugym.pool.pool import FloatArray, MaskArray, Play, PoolSpec, StatusArray
+from fmugym.pool.pool_spec import is_start_time
 from fmugym.pool.rig.clocks import Clock, Paced, TickSchedule
 from fmugym.pool.rig.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.rig.threads import Here, Idle, Worker, ask_all
-from fmugym.pool.spec import is_start_time
 from fmugym.pool.states import Bundle, IndexArray
 
 __all__ = ["Backend", "BackendPool"]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from fmugym.fmi.description import ModelDescription
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.pool_spec import ResetMethod
 
 __all__ = ["find_component_resets", "offers_of"]
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from fmugym.fmi.status import Status
 from fmugym.pool.pool import FloatArray
-from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.pool_spec import PoolSpec, ResetMethod
 from fmugym.pool.trial.trial_episodes import Inputs, Run, Starts, Stretch, play
 from fmugym.pool.trial.trial_workers import TriedPool, Workers
 from fmugym.pool.trial.verdict import Finding, Grade

@@ -34,8 +34,8 @@ from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.fmu import FMU
 from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.licences import speaks_of_licence
+from fmugym.pool.pool_spec import REUSING, PoolSpec, ResetMethod
 from fmugym.pool.processes.supervisor import WorkerError
-from fmugym.pool.spec import REUSING, PoolSpec, ResetMethod
 from fmugym.pool.states import SaveMethod
 from fmugym.pool.trial import trial_steps
 from fmugym.pool.trial.component_resets import find_component_resets, offers_of

@@ -18,7 +18,7 @@ from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.fmi.variable import Variable
 from fmugym.pool.licences import require_licence
 from fmugym.pool.pool import FloatArray, Pool
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = ["Inputs", "Limit", "Run", "Starts", "Stretch", "moving_inputs", "play"]
 

@@ -18,7 +18,7 @@ import numpy as np
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.pool import FloatArray, Pool
-from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.pool_spec import PoolSpec, ResetMethod
 from fmugym.pool.states import Bundle
 from fmugym.pool.trial.library_data import library_data
 from fmugym.pool.trial.reference import BUDGET, SMALL_BUDGET, Budget, Reference

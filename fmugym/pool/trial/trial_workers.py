@@ -13,12 +13,12 @@ from typing import Any, Final, TypeVar
 
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.fmu import DEFAULT_PROBE_TIMEOUT, FMU
+from fmugym.pool.failure_texts import as_messages, quoted
 from fmugym.pool.licences import licence_errors, progress, speaks_of_licence
+from fmugym.pool.pool_spec import INITIALIZATION_FACTOR, PoolSpec
 from fmugym.pool.processes.process_pool import ProcessPool
 from fmugym.pool.processes.supervisor import A_STEP, RESET, Loss, Supervisor, WorkerError
 from fmugym.pool.processes.worker_group import WorkerGroup
-from fmugym.pool.reports import as_messages, quoted
-from fmugym.pool.spec import INITIALIZATION_FACTOR, PoolSpec
 
 __all__ = ["CLOSING", "INITIALIZATION", "STEP", "DeathError", "TriedPool", "Workers"]
 

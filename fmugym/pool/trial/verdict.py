@@ -23,7 +23,7 @@ from fmugym.checks import check_option
 from fmugym.files import cache_folder, read_file, replace_file
 from fmugym.fmi.fmu import FMU
 from fmugym.fmi.systems.system_plan import SystemPlan
-from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.pool_spec import PoolSpec, ResetMethod
 from fmugym.pool.states import SaveMethod
 
 __all__ = [

@@ -5,7 +5,7 @@ from contextlib import closing
 import numpy as np
 
 from fmugym import FMUVectorEnv
-from fmugym.control.surrogate.courses import Courses
+from fmugym.control.surrogate.recorded_trajectories import Courses
 from fmugym.control.surrogate.surrogate_fit import fit
 
 

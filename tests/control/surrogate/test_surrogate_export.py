@@ -15,7 +15,7 @@ from fmugym.deployment.export import write_fmu
 from fmugym.deployment.export.exported_agent import agent_of_surrogate
 from fmugym.envs import HouseEnv, PendulumEnv
 from fmugym.errors import ConfigError
-from fmugym.pool.spec import is_start_time
+from fmugym.pool.pool_spec import is_start_time
 
 pytestmark = pytest.mark.skipif(
     sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler"

@@ -7,7 +7,7 @@ from vector_tools import Drawing, Historic, Reaching, Remembering, Shifted
 
 import fmugym
 from fmugym import ConfigError, ContractError, Uniform
-from fmugym.environment.testing import check_hooks
+from fmugym.environment.env_checker import check_hooks
 
 
 def wide(*shape):

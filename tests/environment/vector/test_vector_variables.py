@@ -10,8 +10,8 @@ from ways import in_way
 
 import fmugym
 from fmugym import Uniform
+from fmugym.environment.env_checker import check_hooks
 from fmugym.environment.hooks import ORDER
-from fmugym.environment.testing import check_hooks
 
 
 class Summing(Drawing):

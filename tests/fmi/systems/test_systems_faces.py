@@ -12,7 +12,7 @@ from fmu_tools import PlainEnv
 import fmugym
 from fmugym import Component, ConfigError, FMUSystem, TaskError, bundled_fmu
 from fmugym.control.identification import Trajectory, fit_parameters
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 
 HOUSE = bundled_fmu("House")
 

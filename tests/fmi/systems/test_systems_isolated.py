@@ -35,8 +35,8 @@ from fmugym.fmi.systems.system_plan import ComponentPlan as Planned
 from fmugym.fmi.systems.system_plan import Connector, End, Link, Loop
 from fmugym.fmi.wine import can_run_windows
 from fmugym.pool.native_pool import NativePool
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.processes.process_pool import ProcessPool
-from fmugym.pool.spec import ResetMethod
 
 MASSES = ["first.y1", "second.y2"]
 

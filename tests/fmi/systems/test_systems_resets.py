@@ -17,7 +17,7 @@ from pool_tools import open_pool, start, step
 
 from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.trial.component_resets import find_component_resets
 from fmugym.pool.trial.trial import examine
 

@@ -35,11 +35,11 @@ from fmugym.fmi import Status
 from fmugym.pool import PoolSpec, opening
 from fmugym.pool.engine import Request
 from fmugym.pool.opening import PoolOptions
+from fmugym.pool.pool_spec import ResetMethod
 from fmugym.pool.processes import guard, launcher
 from fmugym.pool.processes import supervisor as supervising
 from fmugym.pool.processes.launcher import _guard
 from fmugym.pool.processes.process_pool import ProcessPool
-from fmugym.pool.spec import ResetMethod
 
 LOG = logging.getLogger("fmugym.test")
 

@@ -9,7 +9,7 @@ from fmugym import FMU, ConfigError, bundled_fmu
 from fmugym.cli.validation import validate
 from fmugym.envs import PendulumEnv
 from fmugym.pool.opening import PoolOptions, open_pool
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 LOG = logging.getLogger("fmugym.test")
 HERE = "in this process"

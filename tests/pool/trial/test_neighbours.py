@@ -10,7 +10,7 @@ from demanding_tools import STEP, DemandingEnv, expected_outputs, make_fmu
 
 import fmugym
 from fmugym.pool.native_pool import NativePool
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 from fmugym.pool.trial.trial import examine
 from fmugym.pool.trial.verdict import Neighbours, known_verdict
 

@@ -23,11 +23,11 @@ from quirk_table import OUTPUTS, QUIRKS
 from ways import in_way
 
 import fmugym
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 from fmugym.errors import ContractError
 from fmugym.pool import opening
 from fmugym.pool.native_pool import NativePool
-from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.pool_spec import PoolSpec, ResetMethod
 from fmugym.pool.trial.trial import examine
 from fmugym.pool.trial.trial_episodes import Inputs
 from fmugym.pool.trial.verdict import Grade, Neighbours, Verdict, known_verdict

@@ -18,7 +18,7 @@ from quirk_table import OUTPUTS
 from test_quirks import QuirkEnv
 
 import fmugym
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 from fmugym.pool.trial import trial as trials_of_fmus
 from fmugym.pool.trial.trial import compare, examine
 from fmugym.pool.trial.verdict import Neighbours, Verdict, known_verdict

@@ -16,7 +16,7 @@ import zoo_table
 import zoo_tools
 from zoo_table import SPECIMENS
 
-from fmugym.environment.testing import check_fmu_env
+from fmugym.environment.env_checker import check_fmu_env
 from fmugym.errors import ContractError
 
 HERE = Path(__file__).parents[2]

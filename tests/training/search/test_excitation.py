@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fmugym.control.candidate_evaluation import CandidateEvaluator
-from fmugym.control.surrogate.courses import Courses
+from fmugym.control.surrogate.recorded_trajectories import Courses
 from fmugym.envs import CartPoleEnv, PendulumEnv
 from fmugym.training.search.excitation import excite
 from fmugym.training.search.policy import ResidualAgent

@@ -33,7 +33,7 @@ from fmugym.environment.vector import FMUVectorEnv
 from fmugym.environment.vector.expression_task import Expressions
 from fmugym.records.evaluation import HELD_OUT_SEED
 from fmugym.training import search_training
-from fmugym.training.search import twin
+from fmugym.training.search import surrogate_search
 from fmugym.training.search.policy import (
     LIMIT,
     POLICY_FILE,
@@ -45,7 +45,7 @@ from fmugym.training.search.policy import (
 )
 from fmugym.training.search.policy_search import VALIDATION, Search
 from fmugym.training.search.probe import MOST_PROBED, Probe
-from fmugym.training.search.twin import TwinSearch
+from fmugym.training.search.surrogate_search import TwinSearch
 from fmugym.training.search_training import Searching
 
 AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
@@ -1341,7 +1341,7 @@ class TestBudget:
         """Nothing before the first proof on the FMU, and the best one after it."""
         search = TwinSearch._search
         monkeypatch.setattr(Probe, "round_time", lambda *_: 1.0)
-        monkeypatch.setattr(twin, "_is_close", lambda *_: False)
+        monkeypatch.setattr(surrogate_search, "_is_close", lambda *_: False)
 
         def interrupted(self, evaluator, cycle):
             if cycle == cycles:

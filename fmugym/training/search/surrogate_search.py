@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from fmugym.control.candidate_evaluation import CandidateEvaluator, CandidateScores, Merit
-from fmugym.control.surrogate.courses import Courses
+from fmugym.control.surrogate.recorded_trajectories import Courses
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit
 from fmugym.errors import ConfigError

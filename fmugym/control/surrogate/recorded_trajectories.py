@@ -15,7 +15,7 @@ from fmugym.fmi.variable import Variable
 from fmugym.pool.native_pool import play_around
 from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.pool import FloatArray, MaskArray, Play, Pool, PoolSpec, StatusArray
-from fmugym.pool.spec import ResetMethod
+from fmugym.pool.pool_spec import ResetMethod
 
 __all__ = ["Course", "Courses", "RecordingPool"]
 

@@ -22,7 +22,7 @@ from fmugym.fmi.systems.system_description import SystemDescription
 from fmugym.fmi.temporary import is_plain_path
 from fmugym.fmi.variable import Variable
 from fmugym.pool.licences import speaks_of_licence
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.pool_spec import PoolSpec
 
 __all__ = [
     "FRESH_PROCESSES",

@@ -20,7 +20,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.fmi.variable import checked_value
 from fmugym.pool.pool import FloatArray, MaskArray
-from fmugym.pool.spec import START_TIME
+from fmugym.pool.pool_spec import START_TIME
 from fmugym.pool.states import Bundle, IndexArray
 
 __all__ = [

@@ -19,7 +19,7 @@ from fmugym.checks import check_mapping, check_number, number_of
 from fmugym.environment.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, ConsequenceError, TaskError, nearest_name, printable, shown
 from fmugym.expressions.language import CONSTANTS, Expression
-from fmugym.pool.spec import whole_number_of_steps
+from fmugym.pool.pool_spec import whole_number_of_steps
 
 __all__ = [
     "Entry",

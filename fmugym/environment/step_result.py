@@ -9,8 +9,8 @@ from math import hypot, isfinite
 from typing import Any, Final
 
 from fmugym.environment.construction import Constructed
+from fmugym.environment.hook_results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.environment.hooks import NUMBERS, call_hooks
-from fmugym.environment.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.health import fault_rates
