@@ -104,9 +104,11 @@ class TaskVariable:
         """The FMU's variable.
 
         Raises:
-            ConfigError: If there is none.
+            ConfigError: If there is none; a ``ConsequenceError`` if its name has a mistake.
         """
         if self.in_fmu is None:
+            if self.entry.mistakes.explain(self.entry.child("name").keys):
+                raise ConsequenceError(f"the name of {self.alias!r} in the FMU has a mistake")
             raise self.entry.error(
                 f"{self.alias!r} is no variable of the FMU; give the FMU's name of it: "
                 f'{self.alias} = {{ name = "..." }}'

@@ -206,6 +206,19 @@ CONSEQUENCES = {
         {"expressions": {"a": "b + 1", "b": "c", "c": "a"}, "reward": "-a - b - c"},
         ["expressions.a"],
     ),
+    "the FMU's name of a variable": (
+        {"variables": {"tau": {}, "w": {"name": 3}}, "reward": "-w"},
+        ["variables.w.name"],
+    ),
+    "an expression of another one": (
+        {"expressions": {"other": "1 +"}, "reward": "-other"},
+        ["expressions.other"],
+    ),
+    "a set point": ({"setpoints": {"s": "a"}, "reward": "-s"}, ["setpoints.s"]),
+    "a term of the reward": (
+        {"reward": {"a": "1 +"}, "kpis": {"k": "a"}},
+        ["reward.a"],
+    ),
     "a set point of something": (
         {
             "setpoints": {"goal": {"value": 0, "of": "qq"}},
