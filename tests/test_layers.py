@@ -93,6 +93,22 @@ def test_a_package_imports_lower_storeys_only():
     assert upwards == EXCEPTIONS
 
 
+def test_environments_need_nothing_above_them():
+    """``import fmugym.environment`` reaches expressions, pools, FMUs and pictures, and no task."""
+    reached, left = set(), {m for m in MODULES if package_of(m) == "environment"}
+    while left:
+        reached |= left
+        left = {name for module in left for name in imports_of(module) & MODULES.keys()} - reached
+    folders = {package_of(name) for name in reached if MODULES[name].parent != PACKAGE}
+    assert folders == {"environment", "expressions", "pool", "fmi", "rendering"}
+
+
+def test_the_package_shows_at_a_glance_what_it_does():
+    packages = [*PACKAGE.glob("*/__init__.py")]
+    assert 0 < len(packages) <= 13
+    assert 0 < len([*PACKAGE.glob("*.py")]) <= 8
+
+
 def test_the_core_opens_optional_packages_in_functions_only():
     found = []
     for module in (module for module in MODULES if package_of(module) in CORE):
