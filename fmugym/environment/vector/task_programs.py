@@ -27,10 +27,7 @@ __all__ = [
     "TaskPrograms",
     "Translation",
     "compile_formulas",
-    "counted",
-    "ended",
     "formulas_of",
-    "seen_stores",
     "to_input_type",
     "written_variables",
 ]
@@ -85,12 +82,12 @@ class TaskPrograms:
         """
         graph, real = Graph(), np.dtype(np.float64)
         stopped = Value(graph, graph.load("stopped", None, _FLAG))
-        conclusion = compile_graph(graph, ended(stopped, None, None, limit))
+        conclusion = compile_graph(graph, _result_stores(stopped, None, None, limit))
         graph = Graph()
         given = [graph.load("row", ("given", i), real) for i in range(inputs)]
         stores = [Store(node, ("input", i)) for i, node in enumerate(given)]
         return cls(
-            compile_graph(graph, [*stores, counted(graph)]),
+            compile_graph(graph, [*stores, _count_store(graph)]),
             conclusion,
             compile_graph(Graph(), []),
             (),
@@ -105,15 +102,15 @@ class TaskPrograms:
         return replace(self, inputs=inputs, conclusion=conclusion, observation=observation)
 
 
-def counted(graph: Graph) -> Store:
-    """Count a step."""
+def _count_store(graph: Graph) -> Store:
+    """The count of steps with this one, to be stored."""
     return Store((_row(graph, "step_count", _COUNT) + 1).cast(_COUNT).node, ("step_count", 0))
 
 
-def ended(
+def _result_stores(
     terminated: Value, truncated: Value | None, reward: Value | None, limit: int
 ) -> list[Store]:
-    """Store the results of a step, and which episodes have ended.
+    """The results of a step, and which episodes have ended, to be stored.
 
     Args:
         terminated: Where tasks have ended.
@@ -135,8 +132,8 @@ def ended(
     return [Store(value.node, (kind, 0)) for kind, value in results.items()]
 
 
-def seen_stores(number: int, values: Sequence[Value]) -> list[Store]:
-    """Store the elements of an array of observations or infos, which has this number."""
+def _seen_stores(number: int, values: Sequence[Value]) -> list[Store]:
+    """The elements of an array of observations or infos, to be stored, by its number."""
     letter, count = letter_of(values[0].dtype), len(values)
     return [
         Store(value.node, ("seen", number, place, count, TYPES.index(letter)))
@@ -236,7 +233,7 @@ def _inputs(env: FMUEnv, formulas: Formulas) -> Program:
     graph = Graph()
     inputs = Translation(env, graph, has_stepped=False).inputs(formulas)
     stores = [Store(value.node, ("input", i)) for i, value in enumerate(inputs)]
-    return compile_graph(graph, [*stores, counted(graph)])
+    return compile_graph(graph, [*stores, _count_store(graph)])
 
 
 def _conclusion(env: FMUEnv, formulas: Formulas, limit: int) -> tuple[Program, tuple[str, ...]]:
@@ -260,8 +257,8 @@ def _conclusion(env: FMUEnv, formulas: Formulas, limit: int) -> tuple[Program, t
     )
     shown = Translation(env, graph, True, known | {("done",): done & has_stepped})
     for number, (_, elements) in enumerate(_seen(env, formulas, shown)):
-        stores += seen_stores(number, elements)
-    stores += ended(done, truncated, reward, limit)
+        stores += _seen_stores(number, elements)
+    stores += _result_stores(done, truncated, reward, limit)
     return compile_graph(graph, stores), updated
 
 
@@ -270,7 +267,7 @@ def _observation(env: FMUEnv, formulas: Formulas) -> tuple[Program, tuple[SeenAr
     graph = Graph()
     values = Translation(env, graph, True, {("done",): Value.of(graph, False)})
     seen = _seen(env, formulas, values)
-    stores = [seen_stores(number, elements) for number, (_, elements) in enumerate(seen)]
+    stores = [_seen_stores(number, elements) for number, (_, elements) in enumerate(seen)]
     return compile_graph(graph, [*chain(*stores)]), tuple(array for array, _ in seen)
 
 
