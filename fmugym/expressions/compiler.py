@@ -170,7 +170,7 @@ class _Compiler:
             self._constants_in(registers),
             tuple(self._rows),
             tuple(self._graph.tables[key] for key in self._tables),
-            max(registers.values(), default=-1) + 1,
+            max(registers.values(), default=0) + 1,  # instructions without one name the first
         )
 
     def _constants_in(self, registers: dict[int, int]) -> Any:

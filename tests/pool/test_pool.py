@@ -251,6 +251,18 @@ class TestDynamics:
                 plant.rollout(warm, np.array([[1.5]]), inputs), expected[3:]
             )
 
+    @each_pool
+    def test_inputs_have_given_start_values_in_the_warm_up(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["sum"], warm_up_steps=2)
+        assert set_up(pool, a=0.5)[0].tolist() == [[0.1]]
+
+    @each_pool
+    def test_time_begins_at_the_start_time(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["end"], start_time=2.0)
+        for _ in range(2):
+            set_up(pool)
+            assert step(pool)[0].tolist() == [[2.1]]
+
     def test_observations(self, plant):
         pool = plant.pool(3, num_observed=2)
         plant.rollout(pool, plant.start_values(8, 3), [])
@@ -297,6 +309,16 @@ class TestArrays:
         pool.step(given)
         given[:] = 9.0
         assert pool.step()[0].tolist() == [[0.5]]
+
+    @each_pool
+    def test_counts_of_health_are_those_of_their_moment(self, make_pool, probe, version):
+        pool = make_pool(probe(version), ["a"], ["mix"])
+        set_up(pool)
+        before = pool.health()
+        set_up(pool)
+        step(pool)
+        for counts, expected in ((before, [[1], [0]]), (pool.health(), [[2], [1]])):
+            assert [counts[name].tolist() for name in ("resets", "steps")] == expected
 
 
 class TestConstruction:
@@ -404,6 +426,24 @@ class TestSavedInstances:
         assert np.array_equal(other.outputs[:, 0], first)
         given = inputs[:, :, [0, 2, 0, 2]]
         assert np.array_equal(self.go_on(other, given)[:, :, 1:], expected[:, :, [2, 0, 2]])
+
+    def test_of_different_lengths_change_places(self, plant):
+        pool, inputs = self.halfway(plant)
+        mask, places = np.array([False, True, False]), np.array([2, 0, 1])
+        pool.reset((pool.variable(plant.start),), plant.start_values(6, 3), mask)
+        self.go_on(pool, inputs[:2])
+        saved = pool.save_instances(np.arange(3))
+        expected = self.go_on(pool, inputs[2:])
+        pool.restore_instances(saved, places, np.arange(3))
+        found = self.go_on(pool, inputs[2:, :, places])
+        assert np.array_equal(found, expected[:, :, places])
+
+    def test_leave_inputs_as_they_were_written(self, plant):
+        pool, inputs = self.halfway(plant)
+        saved = pool.save_instances(np.arange(3))
+        pool.inputs[:] = inputs[0]
+        pool.restore_instances(saved, np.arange(3), np.arange(3))
+        assert np.array_equal(pool.inputs, inputs[0])
 
     def test_after_a_reset_that_follows_all_is_as_ever(self, plant):
         pool, inputs = self.halfway(plant, 1)

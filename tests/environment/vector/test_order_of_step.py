@@ -5,7 +5,7 @@ import pytest
 from fmu_tools import probe_config
 from vector_tools import require_equal, require_same_infos
 
-from fmugym import Choice, FMI2CSEnv, Uniform, bundled_fmu
+from fmugym import Choice, FMI2CSEnv, SimulationError, Uniform, bundled_fmu
 from fmugym.envs import CartPoleEnv, HouseEnv
 
 COUNT, STEPS = 5, 120
@@ -134,3 +134,16 @@ def test_one_call_and_its_parts_give_the_same(task, pool, mode, make_envs, probe
         require_equal(ours.get_attr("step_count"), theirs.get_attr("step_count"))
         ends += int((one[2] | one[3]).sum()) if len(one) == 5 else 0
     assert ends > 2 * COUNT
+
+
+@pytest.mark.parametrize("pool", POOLS)
+def test_a_reset_of_one_leaves_the_ends_of_others(pool, make_envs):
+    """Also one with options, which no pool does by itself."""
+    options = {"max_episode_steps": 1, "autoreset_mode": "disabled"} | POOLS[pool][0]
+    envs = make_envs(CartPoleEnv, 3, **options)
+    envs.reset(seed=1)
+    assert envs.step(np.zeros(3, int))[3].all()
+    first = np.array([True, False, False])
+    envs.reset(options={"reset_mask": first, "model_parameters": {"x_0": 0.01}})
+    with pytest.raises(SimulationError, match="environment 1 has ended"):
+        envs.step(np.zeros(3, int))
