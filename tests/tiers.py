@@ -296,6 +296,7 @@ SLOW_TESTS = (
 """Others, by the beginning of their node ids."""
 
 EXHAUSTIVE_TESTS = (
+    "test_quirks.py::test_the_check_finds_bad_resets[3-stops, slow at first",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
     "test_baselines_mpc.py::TestCommandLine::test_thinking_ahead",
