@@ -37,7 +37,7 @@ typedef struct {
     size_t count;
 } RowCopies;
 
-/* What a row holds where an episode starts. */
+/* Value of a row where an episode starts. */
 typedef enum { START_CONSTANT, START_ROW, START_DRAW } StartKind;
 
 typedef struct {
@@ -50,7 +50,7 @@ typedef struct {
     } from;
 } RowStart;
 
-/* In the order in which rows are filled. */
+/* Rows and their values where an episode starts, in the order in which they are filled. */
 typedef struct {
     const RowStart *rows;
     size_t count;
@@ -59,7 +59,7 @@ typedef struct {
 /* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
     size_t count;
-    Program inputs;    /* stores the inputs */
+    Program inputs;    /* stores the inputs, and counts the step */
     Program conclusion; /* stores the rest: episode variables, results, which episodes have ended */
     Program observation; /* stores the observations and infos of episodes that start */
     Source source;     /* only the statuses; each step sets the rest */
