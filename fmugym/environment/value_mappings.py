@@ -224,15 +224,14 @@ class LateDict(dict[str, Any]):
     methods would find ``UNFILLED``; no function of the standard library does that.
 
     Args:
-        pending: Under ``UNFILLED`` a tuple: a function that returns the items, and its arguments.
+        pending: A function that returns the items, and its arguments. Until they are asked for,
+            they are kept under ``UNFILLED``, because ``json`` believes an empty dict at once.
     """
 
     __slots__ = ()
 
-    @classmethod
-    def of(cls, fill: Callable[..., Mapping[str, Any]], *arguments: Any) -> LateDict:
-        """Make a dict that a function of these arguments fills."""
-        return cls({UNFILLED: (fill, *arguments)})
+    def __init__(self, *pending: Any) -> None:
+        dict.__setitem__(self, UNFILLED, pending)
 
     def _filled(self) -> dict[str, Any]:
         pending = dict.pop(self, UNFILLED, None)

@@ -250,6 +250,9 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     const Source source = source_of(turn);
     Notes notes = {.outside = false};
 
+    if (play->observation.length == 0) {
+        return;
+    }
     copy_rows(&play->before_conclusion, begin, count);
     program_run(&play->observation, &source, begin, count, &scratch->observation, &notes);
     add_notes(&notes, count, verdict);

@@ -171,7 +171,7 @@ class TestLateDict:
             self.calls += 1
             return {"a": 1 + offset, "b": 2}
 
-        return LateDict.of(fill, 0)
+        return LateDict(fill, 0)
 
     def test_every_method_of_dict_is_tried(self):
         others = {

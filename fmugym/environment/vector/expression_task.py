@@ -179,19 +179,19 @@ class Expressions(VectorTask):
 
     # Steps
 
-    def _step(self, actions: Any, restart: bool) -> StepResult:
-        """See ``VectorTask._step``; a pool that can does all of it in one call."""
+    def step(self, actions: Any, may_restart: bool = False) -> StepResult:
+        """See ``VectorTask.step``; a pool that can does all of it in one call."""
         play: Any = self._play
         any_ended = self.episodes.any_ended
-        starts = (any_ended or restart) and self._pool_starts
+        starts = (any_ended or may_restart) and self._pool_starts
         if play.step is None or self.offsets is not None or (any_ended and not starts):
-            return super()._step(actions, restart)
-        step, at_ends = play.start_and_step if starts else play.step, restart and starts
+            return super().step(actions)
+        step, at_ends = play.start_and_step if starts else play.step, may_restart and starts
         self.has_moved = True  # unless the call refuses its arguments
         try:
             played: Played = step(actions, at_ends)
         except _REFUSALS as error:
-            return self._step(self._converted(actions, error), restart)
+            return self.step(self._converted(actions, error), may_restart)
         return self._completed(played, None)
 
     def _take_actions(self, actions: Any, idle: MaskArray | None) -> npt.NDArray[Any]:
@@ -265,8 +265,8 @@ class Expressions(VectorTask):
         layout, started = self._layout, None
         observations, infos = (seen[0], {}) if layout.is_plain else layout.parts(seen)
         if starts is not None:
-            started = starts[0]
-            self._tell_starts(infos, *starts)
+            started, drawn, last = starts
+            self._tell_starts(infos, started, drawn, last)
         result = observations, rewards, terminated, truncated, infos
         if troubled:
             settle_faults(self.episodes, result, troubled, idle if started is None else started)

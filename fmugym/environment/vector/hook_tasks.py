@@ -80,8 +80,8 @@ class ArrayHooks(Expressions):
 
     # Steps
 
-    def _step(self, actions: Any, restart: bool) -> StepResult:
-        """See ``Expressions._step``; hooks tell which episodes end, so that none restarts."""
+    def step(self, actions: Any, may_restart: bool = False) -> StepResult:
+        """See ``Expressions.step``; hooks tell which episodes end, so that none restarts."""
         play: Any = self._play
         fresh = self.episodes.ended.copy() if self.episodes.any_ended else None
         is_native = play.step is not None and self.offsets is None
@@ -117,8 +117,8 @@ class ArrayHooks(Expressions):
         infos: dict[str, Any] = {}
         started = idle
         if starts is not None:
-            started = starts[0]
-            self._tell_starts(infos, *starts)
+            started, drawn, last = starts
+            self._tell_starts(infos, started, drawn, last)
         self._idle = started
         if troubled:
             failed = failed_in(self._pool.statuses)
@@ -308,13 +308,13 @@ class EachHooks(VectorTask):
 
     # Steps
 
-    def step(
-        self, actions: Any, *, restart: bool = False, resting: MaskArray | None = None
+    def _compose(
+        self, actions: Any, fresh: MaskArray | None, resting: MaskArray | None
     ) -> StepResult:
-        """See ``VectorTask.step``."""
+        """See ``VectorTask._compose``."""
         self.has_moved = False
         try:
-            return super().step(actions, restart=restart, resting=resting)
+            return super()._compose(actions, fresh, resting)
         except BaseException:
             for env in self.episodes.envs:
                 if self.has_moved:  # its FMU has stepped without a result

@@ -3,7 +3,7 @@
 Infos are arrays by name with environments on the first axis, each with a mask that says which
 environments it is for: ``infos["x"]`` and ``infos["_x"]``, as in Gymnasium's vector environments.
 Outside of its mask an array holds zeros, or None where it holds objects. A dict in an info becomes
-a dict of such arrays, with a mask of its own.
+a dict of such arrays, with a mask of its own. Names may share a mask.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ def add_starts(
         drawn: What they have drawn, shape (draws, N), which is rarely read.
         mask: The environments. No caller changes it.
     """
-    infos["drawn"] = LateDict.of(_told, draws, drawn, mask)
+    infos["drawn"] = LateDict(_told, draws, drawn, mask)
     infos["_drawn"] = mask
 
 
@@ -196,10 +196,10 @@ def add_ends(
         infos: The infos.
         observations: The last observations.
         told: The last infos.
-        ended: Which episodes have ended, shape (N,).
+        ended: Which episodes have ended, shape (N,). No caller changes it.
     """
-    infos["final_obs"], infos["_final_obs"] = observations, ended.copy()
-    infos["final_info"], infos["_final_info"] = told, ended.copy()
+    infos["final_obs"], infos["_final_obs"] = observations, ended
+    infos["final_info"], infos["_final_info"] = told, ended
 
 
 def restricted(infos: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:

@@ -411,9 +411,11 @@ def _play(task: VectorTask, start: Snapshot, places: IndexArray, candidates: Can
         if resting is not None and resting.all():
             arrays.repeat_last(step)
             break
-        result = task.step(act(step, observations), resting=resting)
-        if resting is not None:
-            result = _without(result, observations, resting)
+        chosen = act(step, observations)
+        if resting is None:
+            result = task.step(chosen)
+        else:
+            result = _without(task.step_around(chosen, resting), observations, resting)
         arrays.keep(step, result, resting)
         observations = result[0]
     return arrays.rollout()

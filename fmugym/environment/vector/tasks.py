@@ -61,36 +61,30 @@ class VectorTask(ABC):
 
     # Steps
 
-    def step(
-        self, actions: Any, *, restart: bool = False, resting: MaskArray | None = None
-    ) -> StepResult:
-        """Step the environments.
+    def step(self, actions: Any, may_restart: bool = False) -> StepResult:
+        """Step the environments, and start the episodes that have ended before it.
 
         Args:
             actions: Of all environments.
-            restart: Whether an episode that this step ends is followed by the next one at once.
-                Otherwise the next step starts that one, and does not step its FMU.
-            resting: Which ones stay as they are, shape (N,), with a reward of 0; their episodes
-                count as ended, and no episode starts. None for none.
+            may_restart: Whether the task may also start the next episodes where this step ends
+                some. ``restarted`` starts those that it leaves; without it, the next step starts
+                them, and does not step their FMUs.
         """
-        if resting is not None:
-            return self._step_around(actions, resting)
-        result = self._step(actions, restart)
-        return self.restarted(result) if restart and self.episodes.any_ended else result
+        episodes = self.episodes
+        return self._compose(actions, episodes.ended.copy() if episodes.any_ended else None, None)
 
-    def _step_around(self, actions: Any, resting: MaskArray) -> StepResult:
+    def step_around(self, actions: Any, resting: MaskArray) -> StepResult:
+        """Step some environments, while the others stay as they are; no episode starts.
+
+        Args:
+            actions: Of all environments.
+            resting: Which ones stay as they are, shape (N,), with a reward of 0; their episodes
+                count as ended.
+        """
         result = self._compose(actions, None, resting)
         self.episodes.ended |= resting
         self.episodes.any_ended = True
         return result
-
-    def _step(self, actions: Any, restart: bool) -> StepResult:
-        """Do a step, and start the episodes that have ended before it; see ``step``.
-
-        A task may start those that this step ends, too, or leave them to ``restarted``.
-        """
-        episodes = self.episodes
-        return self._compose(actions, episodes.ended.copy() if episodes.any_ended else None, None)
 
     def _compose(
         self, actions: Any, fresh: MaskArray | None, resting: MaskArray | None

@@ -169,7 +169,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(env.observation_space, count)
         self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
         self._restarts = self.autoreset_mode is AutoresetMode.SAME_STEP
-        self.closed = False  # which each step reads: faster here than in the class
         self._background = Background()
         self.task = make_task(self.maker, env, self.pool, max_episode_steps)
         self.episodes, self.attributes = self.task.episodes, Attributes(self.task)
@@ -198,8 +197,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
         refuse_positional(misplaced)
-        if self.closed or self._background.is_pending:
-            require_open(self, "reset")
+        require_open(self, "reset")
         if seed is None and self.episodes.is_ready:
             try:
                 result = self.task.reset_by(options)
@@ -240,6 +238,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
+        self._require_ready("step")
         return self._step(actions)
 
     def step_around(self, actions: Any, resting: MaskArray) -> StepResult:
@@ -260,7 +259,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._require_ready("step_around", ended=True)
         try:
-            return self.task.step(actions, resting=resting)
+            return self.task.step_around(actions, resting)
         except BaseException:  # as in a single environment
             self._interrupt()
             raise
@@ -281,7 +280,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._require_ready("step_async")
         copied = actions.copy() if type(actions) is np.ndarray else copy.deepcopy(actions)
-        self._background.begin(self._step, copied, True)
+        self._background.begin(self._step, copied)
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """Wait for the step that ``step_async`` has begun.
@@ -308,27 +307,26 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _require_ready(self, method: str, *, ended: bool = False) -> None:
         """Refuse a call before the first reset and so on; ``ended`` episodes may be allowed."""
-        if not self.episodes.is_ready or self.closed or self._background.is_pending:
+        episodes = self.episodes
+        if not episodes.is_ready or self._background.is_pending:
             require_open(self, method)
             when = "before the first reset"
-            if self.episodes.started:
+            if episodes.started:
                 when = "after an exception that has ended all episodes; call reset first"
             raise SimulationError(f"{method} was called {when}")
-        if not ended and self.episodes.any_ended and self._waits:
-            index = int(np.flatnonzero(self.episodes.ended)[0])
+        if episodes.any_ended and self._waits and not ended:
+            index = int(np.flatnonzero(episodes.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
-    def _step(self, actions: Any, in_background: bool = False) -> StepResult:
-        episodes, looks = self.episodes, self._at_ends
-        is_busy = self._background.is_pending and not in_background
-        if not episodes.is_ready or self.closed or is_busy or (episodes.any_ended and self._waits):
-            self._require_ready("step")
+    def _step(self, actions: Any) -> StepResult:
+        """Step all environments, in this thread or in the background."""
+        task, restarts = self.task, self._restarts
         try:
-            result = self.task.step(actions, restart=self._restarts and not looks)
-            if looks and self._restarts and episodes.any_ended:
-                for look in looks:
+            result = task.step(actions, restarts and not self._at_ends)
+            if restarts and self.episodes.any_ended:
+                for look in self._at_ends:
                     look(actions)
-                result = self.task.restarted(result)
+                result = task.restarted(result)
             return result
         except BaseException:  # as in a single environment
             self._interrupt()
@@ -533,6 +531,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """Free the pool, after waiting for a step that is under way."""
         if "task" in vars(self):  # otherwise the constructor has closed everything
             self._background.stop()
+            self.episodes.is_ready = False
             try:
                 self.episodes.close()
             finally:
@@ -546,7 +545,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUVectorEnv:
         arguments = copy.deepcopy(self._arguments, memo)
         twin = _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
-        if self.episodes.is_ready and not self.closed:
+        if self.episodes.is_ready:
             twin.restore_state(self.save_state())
         return twin
 

@@ -1252,19 +1252,27 @@ class Budget:
 
     def __init__(self, monkeypatch):
         self.steps, self.is_open = 0, True
-        step, judge = Expressions.step, search_training.judge
+        step, step_around = Expressions.step, Expressions.step_around
+        judge = search_training.judge
 
-        def counted(task, actions, *, restart=False, resting=None):
-            idle = 0 if resting is None else np.count_nonzero(resting)
+        def count(task, steps):
             is_fmu = not isinstance(task.episodes.pool, SurrogatePool)
-            self.steps += (len(actions) - idle) * self.is_open * is_fmu
-            return step(task, actions, restart=restart, resting=resting)
+            self.steps += steps * self.is_open * is_fmu
+
+        def counted(task, actions, may_restart=False):
+            count(task, len(actions))
+            return step(task, actions, may_restart)
+
+        def counted_around(task, actions, resting):
+            count(task, len(actions) - np.count_nonzero(resting))
+            return step_around(task, actions, resting)
 
         def judged(*arguments):
             self.is_open = False
             return judge(*arguments)
 
         monkeypatch.setattr(Expressions, "step", counted)
+        monkeypatch.setattr(Expressions, "step_around", counted_around)
         monkeypatch.setattr(search_training, "judge", judged)
         monkeypatch.setattr(search_training, "monotonic", lambda: 1e-4 * self.steps)
         monkeypatch.setattr(Probe, "round_time", lambda *_: 0.0)
