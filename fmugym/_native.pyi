@@ -81,18 +81,6 @@ def stop_tracing(process: int, stopped_by: int, /) -> None:
         stopped_by: The number of the signal, which it gets now.
     """
 
-def copy_arrays(targets: tuple[Array, ...], sources: tuple[Array, ...], /) -> None:
-    """Copy arrays of one or two dimensions into others of the same shapes and types.
-
-    Args:
-        targets: The arrays to copy into; the elements of a row have no gaps between them.
-        sources: The arrays to copy, likewise.
-
-    Raises:
-        TypeError: If one is no such array.
-        ValueError: If they differ in number or size, or one cannot be written.
-    """
-
 @final
 class Access:
     """A list of variables of one FMI version.
@@ -233,8 +221,8 @@ class Pool:
         those of ``play``.
         """
 
-    def reset_by(self, options: Any, /) -> tuple[Any, ...] | None:
-        """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.pool``."""
+    def start(self, mask: Array, /) -> tuple[Any, ...] | None:
+        """Start episodes; see ``Play.start`` of ``fmugym.pool.pool``."""
 
     def count_steps(self) -> None:
         """Add the steps so far to the counts."""

@@ -126,7 +126,7 @@ class NativePool(EnginePool):
         self._reset = self._pool.reset
         self._starting_play = (
             self._with_files(self._pool.play),
-            self._with_files(self._pool.reset_by),
+            self._with_files(self._pool.start),
         )
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
@@ -285,8 +285,8 @@ class NativePool(EnginePool):
         """See ``Pool.prepare_play``."""
         pool = self._pool
         prepare(pool, self._access(variables), *parts)
-        step, reset = self._starting_play
-        return Play(pool.check_actions, pool.play_before, pool.play_after, pool.play, step, reset)
+        step, start = self._starting_play
+        return Play(pool.check_actions, pool.play_before, pool.play_after, pool.play, step, start)
 
 
 def prepare(

@@ -58,11 +58,10 @@ class Play(NamedTuple):
             and infos of those that have ended in this step, or None. All arrays are new, or those
             of an earlier step that nobody holds any more.
         start_and_step: The same; to be called if episodes may start.
-        reset: A function of the options of a reset. If they are a dict of nothing but
-            ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
-            it starts these episodes and returns how many instances had trouble, whether any episode
-            is at its end now, the arrays of observations and infos, a copy of the mask, and what
-            was drawn. Otherwise it does nothing and returns None.
+        start: A function of a mask. If it is a contiguous array of N Booleans with at least one
+            True, it starts these episodes and returns how many instances had trouble, whether any
+            episode is at its end now, the arrays of observations and infos, a copy of the mask, and
+            what was drawn. Otherwise it does nothing and returns None.
     """
 
     check: Callable[[Any], None]
@@ -70,7 +69,7 @@ class Play(NamedTuple):
     after: Callable[[Any], Played]
     step: Callable[[Any, bool], Played] | None = None
     start_and_step: Callable[[Any, bool], Played] | None = None
-    reset: Callable[[Any], tuple[int, bool, tuple[Any, ...], Any, Any] | None] | None = None
+    start: Callable[[Any], tuple[int, bool, tuple[Any, ...], Any, Any] | None] | None = None
 
 
 class Pool(ABC):

@@ -75,7 +75,7 @@ void maker_drop(Maker *maker) {
     Py_CLEAR(maker->type);
 }
 
-/* Knowing arrays */
+/* Whether nobody else holds an array, refers to it weakly, or has changed it in place. */
 
 static bool has_form(const Maker *maker, const PyArrayObject *array) {
     const size_t lengths = (size_t)maker->dimensions * sizeof *maker->shape;
@@ -90,28 +90,12 @@ static bool has_weak_references(PyObject *array) {
     return *(PyObject **)((char *)array + weak_references) != NULL;
 }
 
-bool maker_knows(const Maker *maker, PyObject *object, char **memory) {
-    if (!PyArray_CheckExact(object)) {
-        return false;
-    }
-    PyArrayObject *array = (PyArrayObject *)object;
-    *memory = PyArray_BYTES(array);
-    return PyArray_BASE(array) == NULL && PyArray_FLAGS(array) == maker->flags &&
-           !has_weak_references(object) && has_form(maker, array);
-}
-
-const char *maker_memory_of(const Maker *maker, PyObject *object) {
-    PyArrayObject *array = (PyArrayObject *)object;
-
-    return PyArray_CheckExact(object) && has_form(maker, array) ? PyArray_BYTES(array) : NULL;
-}
-
-/* Whether an array is what it was when it was made, and nobody else holds it. */
 static bool is_free(const Maker *maker, const Made *made) {
-    char *memory;
+    PyArrayObject *array = (PyArrayObject *)made->array;
 
-    return made->array != NULL && Py_REFCNT(made->array) == 1 &&
-           maker_knows(maker, made->array, &memory) && memory == made->memory;
+    return array != NULL && Py_REFCNT(made->array) == 1 && !has_weak_references(made->array) &&
+           PyArray_BYTES(array) == made->memory && PyArray_BASE(array) == NULL &&
+           PyArray_FLAGS(array) == maker->flags && has_form(maker, array);
 }
 
 /* Providing */
@@ -158,66 +142,4 @@ PyObject *maker_provide(Maker *maker, char **memory) {
     *place = (Made){.array = Py_NewRef((PyObject *)array), .memory = *memory};
     Py_XDECREF(before); /* may call back, and another step then replaces the new array */
     return (PyObject *)array;
-}
-
-/* Copying */
-
-typedef struct {
-    char *place;
-    Py_ssize_t rows, stride; /* bytes from row to row */
-    size_t size;             /* of a row, in bytes */
-} Rows;
-
-static bool take_rows_of(PyObject *object, Rows *rows) {
-    PyArrayObject *array = (PyArrayObject *)object;
-    const int last = PyArray_Check(object) ? PyArray_NDIM(array) - 1 : -1;
-
-    if (last < 0 || last > 1 || (PyArray_DIM(array, last) > 1 &&
-                                 PyArray_STRIDE(array, last) != PyArray_ITEMSIZE(array))) {
-        PyErr_SetString(PyExc_TypeError, "expected arrays whose rows have no gaps");
-        return false;
-    }
-    *rows = (Rows){.place = PyArray_BYTES(array),
-                   .rows = last == 0 ? 1 : PyArray_DIM(array, 0),
-                   .stride = last == 0 ? 0 : PyArray_STRIDE(array, 0),
-                   .size = (size_t)PyArray_DIM(array, last) * (size_t)PyArray_ITEMSIZE(array)};
-    return true;
-}
-
-static bool copy_array(PyObject *target, PyObject *source) {
-    Rows to, from;
-
-    if (!take_rows_of(target, &to) || !take_rows_of(source, &from)) {
-        return false;
-    }
-    if (to.rows != from.rows || to.size != from.size ||
-        PyArray_FailUnlessWriteable((PyArrayObject *)target, "an array to copy into") < 0) {
-        PyErr_SetString(PyExc_ValueError, "arrays differ in size, or cannot be written");
-        return false;
-    }
-    for (Py_ssize_t i = 0; i < to.rows; i++) {
-        memcpy(to.place + i * to.stride, from.place + i * from.stride, to.size);
-    }
-    return true;
-}
-
-PyObject *py_copy_arrays(PyObject *module, PyObject *args) {
-    PyObject *targets, *sources;
-
-    (void)module;
-    if (PyArray_ImportNumPyAPI() < 0 ||
-        !PyArg_ParseTuple(args, "O!O!:copy_arrays", &PyTuple_Type, &targets, &PyTuple_Type,
-                          &sources)) {
-        return NULL;
-    }
-    if (PyTuple_Size(targets) != PyTuple_Size(sources)) {
-        PyErr_SetString(PyExc_ValueError, "arrays differ in number");
-        return NULL;
-    }
-    for (Py_ssize_t i = 0; i < PyTuple_Size(targets); i++) {
-        if (!copy_array(PyTuple_GetItem(targets, i), PyTuple_GetItem(sources, i))) {
-            return NULL;
-        }
-    }
-    Py_RETURN_NONE;
 }

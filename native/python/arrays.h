@@ -34,22 +34,10 @@ bool numpy_import(void);
 bool maker_take(Maker *maker, PyObject *arguments);
 void maker_drop(Maker *maker);
 
-/* A function of the module: copies arrays of one or two dimensions, whose rows have no gaps, into others
- * of the same shapes and types. */
-PyObject *py_copy_arrays(PyObject *module, PyObject *args);
-
 /* Provides an array: a new one, or an earlier one that only the maker still holds. Returns NULL with
  * an exception if memory runs out. */
 PyObject *maker_provide(Maker *maker, char **memory);
 /* Fills the memory of an array with NaN, or with zeros if it holds no floats. */
 void maker_blank(const Maker *maker, char *memory);
-
-/* Whether an object is an array of this shape, type and strides with memory of its own, as numpy has
- * made it: nobody has changed it in place, or refers to it weakly. If so, sets its memory. */
-bool maker_knows(const Maker *maker, PyObject *object, char **memory);
-
-/* Returns the memory of an array that has the shape, type and strides of the maker's, and whose other
- * properties do not matter; otherwise NULL. */
-const char *maker_memory_of(const Maker *maker, PyObject *object);
 
 #endif

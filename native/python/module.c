@@ -2,7 +2,6 @@
 
 #include <string.h>
 
-#include "python/arrays.h"
 #include "python/handlers.h"
 #include "python/programs.h"
 
@@ -59,7 +58,6 @@ static PyMethodDef functions[] = {
     {"serve", py_serve, METH_VARARGS, NULL},
     {"end_with", py_end_with, METH_O, NULL},
     {"stop_tracing", py_stop_tracing, METH_VARARGS, NULL},
-    {"copy_arrays", py_copy_arrays, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -15,20 +15,6 @@ static void do_start(PyPool *self, bool alone, void *context) {
     t->ends.ended = memchr(play->ended, 1, play->count) != NULL;
 }
 
-/* The mask of a dict that holds nothing else, borrowed; NULL, maybe with an exception, if there is
- * none. */
-static PyObject *mask_of(PyObject *options) {
-    static PyObject *name; /* of this process: other interpreters cannot load this extension */
-
-    if (!PyDict_CheckExact(options) || PyDict_Size(options) != 1) {
-        return NULL;
-    }
-    if (name == NULL) {
-        name = PyUnicode_InternFromString("reset_mask");
-    }
-    return name == NULL ? NULL : PyDict_GetItemWithError(options, name);
-}
-
 static void settle_reset(PyPool *self, const Playing *playing, const ResultArrays *arrays,
                          PyTurn *t) {
     const Results *r = playing->results;
@@ -43,7 +29,7 @@ static void settle_reset(PyPool *self, const Playing *playing, const ResultArray
 }
 
 /* The memory is provided first: that may run code that changes the caller's mask. */
-static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
+static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *mask) {
     const Playing *playing = playing_of(capsule);
     ResultArrays arrays;
     PyTurn t = {.bad_action = false};
@@ -64,20 +50,14 @@ static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
     return result;
 }
 
-PyObject *py_reset_by(PyObject *object, PyObject *options) {
+PyObject *py_start(PyObject *object, PyObject *mask) {
     PyPool *self = (PyPool *)object;
 
     if (!is_prepared(self)) {
         return NULL;
     }
-    PyObject *mask = mask_of(options);
-    if (mask == NULL) {
-        return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
-    }
-    Py_INCREF(mask);
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = reset_by(self, playing, mask);
+    PyObject *result = start_with(self, playing, mask);
     Py_DECREF(playing);
-    Py_DECREF(mask);
     return result;
 }

@@ -124,7 +124,7 @@ static PyMethodDef methods[] = {
     {"check_actions", py_check_actions, METH_O, NULL},
     {"play_before", py_play_before, METH_O, NULL},
     {"play_after", py_play_after, METH_O, NULL},
-    {"reset_by", py_reset_by, METH_O, NULL},
+    {"start", py_start, METH_O, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"ask", py_ask, METH_VARARGS, NULL},
     {"close", py_close, METH_NOARGS, NULL},

@@ -80,7 +80,7 @@ PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_seed(PyObject *module, PyObject *args);
 
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
-PyObject *py_reset_by(PyObject *object, PyObject *options);
+PyObject *py_start(PyObject *object, PyObject *mask);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_check_actions(PyObject *object, PyObject *actions);
 PyObject *py_play_before(PyObject *object, PyObject *actions);

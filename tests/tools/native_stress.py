@@ -200,10 +200,10 @@ class Subject:
             if self.rng.random() < 0.5:
                 self.starts = starts
 
-    def reset_by(self):
-        """Hold what some resets return, and read it later."""
+    def start_episodes(self):
+        """Hold what some starts return, and read it later."""
         with contextlib.suppress(ValueError):  # as above
-            result = self.pool._pool.reset_by({"reset_mask": self.mask()})
+            result = self.pool._pool.start(self.mask())
             if result is not None and self.rng.random() < 0.5:
                 self.held = result
                 assert self.held[-1].shape == (1, self.n)
@@ -256,7 +256,7 @@ ACTIONS = (
         "play",
         "play",
         "play",
-        "reset_by",
+        "start_episodes",
         "save",
         "restore",
         "forget",
@@ -269,7 +269,7 @@ ACTIONS = (
 )
 
 
-IN_TURN = {"play", "prepare_play", "reset_by"} if "in-turn" in sys.argv else set()
+IN_TURN = {"play", "prepare_play", "start_episodes"} if "in-turn" in sys.argv else set()
 
 
 class Ring:

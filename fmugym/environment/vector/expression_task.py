@@ -101,7 +101,7 @@ class Expressions(VectorTask):
         indices, streams = np.flatnonzero(mask), self.episodes.streams
         streams.seed(seeds, indices)
         streams.require_seeds()
-        done = None if options else self.reset_by({"reset_mask": mask})
+        done = None if options else self.start_at_once(mask)
         if done is not None:
             return done
         draws = draws_of_reset(self.env, options, "reset_mask")
@@ -115,12 +115,12 @@ class Expressions(VectorTask):
         add_starts(infos, draws, self._of_all(drawn, indices), mask.copy())
         return observations, infos
 
-    def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
-        """See ``VectorTask.reset_by``."""
-        if not self._pool_starts or self._play.reset is None:
+    def start_at_once(self, mask: Any) -> tuple[Any, dict[str, Any]] | None:
+        """See ``VectorTask.start_at_once``."""
+        if not self._pool_starts or self._play.start is None:
             return None
         try:
-            done = self._play.reset(options)
+            done = self._play.start(mask)
         except BaseException:
             self.has_moved = True
             raise

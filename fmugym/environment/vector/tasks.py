@@ -182,11 +182,11 @@ class VectorTask(ABC):
             options: As for a single environment.
         """
 
-    def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
-        """Do a reset of some environments at once, after one of all.
+    def start_at_once(self, mask: Any) -> tuple[Any, dict[str, Any]] | None:
+        """Start episodes of some environments by a call of the pool, after a reset of all.
 
         Args:
-            options: What the caller has given to ``reset``, not checked yet.
+            mask: Which environments, as the caller has given them: not checked yet.
 
         Returns:
             As ``reset``. None if ``reset`` has to do it; then nothing has happened.

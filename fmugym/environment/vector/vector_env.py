@@ -25,6 +25,7 @@ from fmugym.environment.vector.arguments import (
     checked_num_envs,
     checked_pool_options,
     checked_seeds,
+    has_mask_only,
     split_options,
 )
 from fmugym.environment.vector.async_step import Background, PendingStepError
@@ -198,9 +199,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         refuse_positional(misplaced)
         require_open(self, "reset")
-        if seed is None and self.episodes.is_ready:
+        if seed is None and self.episodes.is_ready and has_mask_only(options):
             try:
-                result = self.task.reset_by(options)
+                result = self.task.start_at_once(options["reset_mask"])
             except BaseException:
                 self._interrupt()
                 raise

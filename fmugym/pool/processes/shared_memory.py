@@ -112,9 +112,6 @@ class BlockCopies:
     """
 
     def __init__(self, arrays: Arrays, block: slice, memory: Memory) -> None:
-        from fmugym._native import copy_arrays  # which is not there on every machine
-
-        self._copy = copy_arrays
         own = memory.arrays._asdict()
         blocks = {
             "inputs": arrays.inputs[:, block],
@@ -135,20 +132,25 @@ class BlockCopies:
 
     def give(self) -> None:
         """Copy the arrays that the worker may read or change."""
-        self._copy(*self._pairs)
+        _copy(*self._pairs)
 
     def give_for_step(self) -> None:
         """Copy the arrays that the worker reads in a step; it writes all others."""
-        self._copy(*self._for_step)
+        _copy(*self._for_step)
 
     def take(self) -> None:
         """Copy the arrays that the worker may have changed."""
         shared, blocks = self._pairs
-        self._copy(blocks, shared)
+        _copy(blocks, shared)
 
     def take_counts(self) -> None:
         """Copy the counts."""
-        self._copy(*self._counts)
+        _copy(*self._counts)
+
+
+def _copy(targets: tuple[npt.NDArray[Any], ...], sources: tuple[npt.NDArray[Any], ...]) -> None:
+    for target, source in zip(targets, sources, strict=True):
+        np.copyto(target, source)
 
 
 def _anonymous_file(size: int) -> int:

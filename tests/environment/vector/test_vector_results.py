@@ -120,11 +120,12 @@ def test_what_the_caller_changes_in_place_does_not_come_back(task, mode, change)
     for actions, wanted in zip(sampled_actions(envs, STEPS), expected, strict=True):
         arrays = numbers_of(envs.step(actions))
         require_same(arrays, wanted)
-        for array in arrays:
-            assert array.flags.writeable
-            assert array.flags.owndata
-            change(array)
-        del array, arrays
+        assert all(array.flags.writeable and array.flags.owndata for array in arrays)
+        while arrays:
+            array = arrays.pop()
+            if not any(array is other for other in arrays):  # names may share a mask
+                change(array)
+        del array
     envs.close()
 
 
