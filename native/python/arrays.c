@@ -75,7 +75,7 @@ void maker_drop(Maker *maker) {
     Py_CLEAR(maker->type);
 }
 
-/* Whether nobody else holds an array, refers to it weakly, or has changed it in place. */
+/* Knowing arrays */
 
 static bool has_form(const Maker *maker, const PyArrayObject *array) {
     const size_t lengths = (size_t)maker->dimensions * sizeof *maker->shape;
@@ -86,10 +86,17 @@ static bool has_form(const Maker *maker, const PyArrayObject *array) {
            memcmp(PyArray_STRIDES(array), maker->strides, lengths) == 0;
 }
 
+const char *maker_memory_of(const Maker *maker, PyObject *object) {
+    PyArrayObject *array = (PyArrayObject *)object;
+
+    return PyArray_CheckExact(object) && has_form(maker, array) ? PyArray_BYTES(array) : NULL;
+}
+
 static bool has_weak_references(PyObject *array) {
     return *(PyObject **)((char *)array + weak_references) != NULL;
 }
 
+/* Whether nobody else holds an array, refers to it weakly, or has changed it in place. */
 static bool is_free(const Maker *maker, const Made *made) {
     PyArrayObject *array = (PyArrayObject *)made->array;
 

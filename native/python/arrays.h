@@ -40,4 +40,8 @@ PyObject *maker_provide(Maker *maker, char **memory);
 /* Fills the memory of an array with NaN, or with zeros if it holds no floats. */
 void maker_blank(const Maker *maker, char *memory);
 
+/* Returns the memory of an array that has the shape, type and strides of the maker's, and whose other
+ * properties do not matter; otherwise NULL. */
+const char *maker_memory_of(const Maker *maker, PyObject *object);
+
 #endif

@@ -139,18 +139,15 @@ void results_drop(const Results *r, ResultArrays *a) {
 }
 
 bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) {
-    const size_t place = results_place(r, MASK_ARRAY), size = r->makers[place].size;
-    Py_buffer buffer = {0};
+    const size_t place = results_place(r, MASK_ARRAY);
+    const Maker *own = &r->makers[place];
+    const char *memory = maker_memory_of(own, mask);
 
-    const bool fits = take_vector(mask, &buffer, IN_PLACE, "the mask", ITEM_BOOLEAN,
-                                  (Py_ssize_t)size) &&
-                      memchr(buffer.buf, 1, size) != NULL;
-    if (fits) {
-        memcpy(a->memory[place], buffer.buf, size);
+    if (memory == NULL) {
+        return false;
     }
-    PyErr_Clear();
-    release_buffer(&buffer);
-    return fits;
+    memcpy(a->memory[place], memory, own->size);
+    return memchr(a->memory[place], 1, own->size) != NULL;
 }
 
 /* Returning */

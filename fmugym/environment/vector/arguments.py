@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, TypeGuard
+from typing import Any, Final
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -28,7 +28,6 @@ __all__ = [
     "checked_num_envs",
     "checked_pool_options",
     "checked_seeds",
-    "has_mask_only",
     "split_options",
 ]
 
@@ -151,11 +150,6 @@ def _elements(values: Any) -> list[Any] | None:
         return list(values)
     except Exception:  # an array without a dimension, or the user's own __iter__
         return None
-
-
-def has_mask_only(options: Any) -> TypeGuard[dict[str, Any]]:
-    """Whether the argument ``options`` of ``reset`` is a dict of a ``"reset_mask"``."""
-    return type(options) is dict and len(options) == 1 and "reset_mask" in options
 
 
 def split_options(options: Any, num_envs: int) -> tuple[dict[str, Any], MaskArray]:

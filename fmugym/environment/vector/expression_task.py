@@ -117,16 +117,14 @@ class Expressions(VectorTask):
 
     def start_at_once(self, mask: Any) -> tuple[Any, dict[str, Any]] | None:
         """See ``VectorTask.start_at_once``."""
-        if not self._pool_starts or self._play.start is None:
+        if not self._pool_starts:
             return None
-        try:
-            done = self._play.start(mask)
-        except BaseException:
-            self.has_moved = True
-            raise
-        if done is None:
-            return None
+        play: Any = self._play
         self.has_moved = True
+        done = play.start(mask)
+        if done is None:
+            self.has_moved = False
+            return None
         troubled, self.episodes.any_ended, seen, mask, drawn = done
         if troubled:
             require_started(self._pool, np.flatnonzero(mask))

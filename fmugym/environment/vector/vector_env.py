@@ -25,7 +25,6 @@ from fmugym.environment.vector.arguments import (
     checked_num_envs,
     checked_pool_options,
     checked_seeds,
-    has_mask_only,
     split_options,
 )
 from fmugym.environment.vector.async_step import Background, PendingStepError
@@ -197,9 +196,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
-        refuse_positional(misplaced)
-        require_open(self, "reset")
-        if seed is None and self.episodes.is_ready and has_mask_only(options):
+        if misplaced:
+            refuse_positional(misplaced)
+        if not self.episodes.is_ready or self._background.is_pending:
+            require_open(self, "reset")
+        elif seed is None and type(options) is dict and [*options] == ["reset_mask"]:
             try:
                 result = self.task.start_at_once(options["reset_mask"])
             except BaseException:
