@@ -168,6 +168,10 @@ class CandidateEvaluator:
         costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self.limits) + 1], axis=-1)
         return CandidateScores(totals[0], costs, self.limits, moments)
 
+    def count_anew(self, most_steps: int) -> None:
+        """Count steps and seconds from 0, of episodes of at most so many steps."""
+        self.most_steps, self.steps, self.seconds = most_steps, 0, 0.0
+
     def open(self, jobs: int) -> FMUVectorEnv:
         """Make the environments for so many episodes, unless there are enough.
 

@@ -9,11 +9,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.control.candidate_evaluation import MOST_STEPS, CandidateEvaluator, most_steps_of
+from fmugym.control.candidate_evaluation import (
+    MOST_STEPS,
+    CandidateEvaluator,
+    CandidateScores,
+    most_steps_of,
+)
 from fmugym.control.controller_parsing import plans_ahead, simple_controllers
 from fmugym.control.controller_table import acting_text, named_controllers, parts_of
 from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.pool.pool import FloatArray
 from fmugym.task.likely_units import require_units
 from fmugym.training.search.policy import ResidualAgent, ResidualPolicy, require_numbers
 from fmugym.training.search.suggested_controllers import (
@@ -43,7 +49,6 @@ many steps: the overhead of a call is for all of them."""
 
 MOST_PROBED: Final = _EPISODES * (_ACTIONS * (_TRIED + _STEPS) + FEW * _TIMED)
 """Most steps of a probe. All of them count, since the number that is played depends on the time."""
-
 
 _TEST_BY_LOOK: Final = 5
 """The test by which controllers are guessed takes so many times the time of the look."""
@@ -101,72 +106,132 @@ class Probe:
         Raises:
             ConfigError: If no policy can be searched for the task, or its first step always fails.
         """
-        with closing(make_env()) as env:
-            require_numbers(env.observation_space, env.action_space)
-            policy, task = ResidualPolicy(None).bind(env), agent_task(env)
-            require_units(env)
-            agents = list(_declared(task, env, tell))
-            loops = None if agents else Loops.of(task, env)
-            length = most_steps_of(env)
-            limits = dict(getattr(env, "cost_limits", {}))
-        linear = ResidualAgent("linear", None, len(policy.names), policy.acting)
-        constant = ResidualAgent("constant action", acting=policy.acting)
-        rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
-
-        steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
+        declared = _Declarations.of(make_env, tell)
         with closing(CandidateEvaluator(make_env, envs, _TRIED, backend=backend)) as evaluator:
-            seeds = range(_EPISODES)
+            look = _look(evaluator, declared.linear, most, seconds)
             if seconds < np.inf:
-                evaluator.play(linear, rows[:_ACTIONS], seeds)
-                needed = most * evaluator.seconds / evaluator.steps
-                steps = steps if needed <= seconds else max(_TRIED, int(steps * seconds / needed))
-            evaluator.most_steps, evaluator.seconds, evaluator.steps, evaluator.longest = (
-                steps,
-                0.0,
-                0,
-                0,
-            )
-            outcome = evaluator.play(linear, rows[:_ACTIONS], seeds, has_moments=True)
-            if evaluator.steps == outcome.costs[..., -1].sum():
-                raise ConfigError(
-                    f"the first step fails, whatever the action: {evaluator.infos['fault'][0]}; "
-                    "'fmugym validate' tells more"
-                )
-            if (
-                most == MOST_PROBED
-                and steps == _STEPS
-                and evaluator.seconds < _QUICK * evaluator.steps
-            ):
-                evaluator.most_steps, evaluator.seconds, evaluator.steps = _TIMED, 0.0, 0
-                evaluator.play(linear, rows, seeds)
-            pace, longest = evaluator.seconds / evaluator.steps, evaluator.longest
-            if seconds < np.inf:
-                most_tested = int(min(most_tested, _TEST_BY_LOOK * seconds / max(pace, 1e-9)))
-            agents = agents or list(_guessed(evaluator, loops, tell, most_tested))
-        seen = np.dstack([outcome.returns, outcome.moments])
-        if np.ptp(outcome.returns) == 0:
-            tell(
-                f"warning: all episodes have reached {outcome.returns[0, 0]:g}, whatever the "
-                "actions: what is to be learned?"
-            )
-        if length is None:
-            tell(f"warning: episodes have no length; they are stopped after {MOST_STEPS} steps")
-        most_steps = length or MOST_STEPS
+                in_time = _TEST_BY_LOOK * seconds / max(look.seconds, 1e-9)
+                most_tested = int(min(most_tested, in_time))
+            guessed = _guessed(evaluator, declared.loops, tell, most_tested)
+            agents = declared.agents or list(guessed) or [declared.constant]
+        _warn(declared, look.scores, tell)
+        most_steps = declared.length or MOST_STEPS
+        tested = 0 if declared.loops is None else steps_of_test(declared.loops, most_tested)
         return cls(
-            task,
-            linear,
-            agents or [constant],
-            limits,
+            declared.task,
+            declared.linear,
+            agents,
+            declared.limits,
             most_steps,
-            is_same=not np.ptp(seen, axis=1).any(),
-            seconds=pace,
-            usual_steps=longest if longest < steps else most_steps,
-            steps=most + (0 if loops is None else steps_of_test(loops, most_tested)),
+            is_same=not np.ptp(look.seen, axis=1).any(),
+            seconds=look.seconds,
+            usual_steps=look.longest if look.longest < look.steps else most_steps,
+            steps=most + tested,
         )
 
     def round_time(self, episodes: int) -> float:
         """Estimated seconds of a round of a controller, until episodes become longer."""
         return self.seconds * self.usual_steps * FEW * episodes
+
+
+@dataclass(frozen=True)
+class _Declarations:
+    """Declarations of a task that an environment of it has.
+
+    Attributes:
+        task: See ``agent_task``.
+        linear: As in ``Probe``.
+        constant: The agent of a constant action.
+        agents: The controllers that the task declares, as in ``Probe``.
+        loops: The loops for which controllers may be guessed, if it declares none.
+        length: The most steps of an episode, if it has a length.
+        limits: Limits of the costs of an episode.
+    """
+
+    task: Mapping[str, Any]
+    linear: ResidualAgent
+    constant: ResidualAgent
+    agents: list[ResidualAgent]
+    loops: Loops | None
+    length: int | None
+    limits: Mapping[str, float]
+
+    @classmethod
+    def of(cls, make_env: Callable[[], FMUEnv], tell: Callable[[str], None]) -> _Declarations:
+        with closing(make_env()) as env:
+            require_numbers(env.observation_space, env.action_space)
+            policy, task = ResidualPolicy(None).bind(env), agent_task(env)
+            require_units(env)
+            agents = list(_declared(task, env, tell))
+            return cls(
+                task,
+                ResidualAgent("linear", None, len(policy.names), policy.acting),
+                ResidualAgent("constant action", acting=policy.acting),
+                agents,
+                None if agents else Loops.of(task, env),
+                most_steps_of(env),
+                dict(getattr(env, "cost_limits", {})),
+            )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """Some episodes of constant actions.
+
+    Attributes:
+        scores: What they have reached.
+        seconds: Real time of a step of one environment among many.
+        longest: The steps of the longest one.
+        steps: The steps after which each was stopped.
+    """
+
+    scores: CandidateScores
+    seconds: float
+    longest: int
+    steps: int
+
+    @property
+    def seen(self) -> FloatArray:
+        """Numbers that differ where episodes differ, shape (actions, episodes, k)."""
+        return np.dstack([self.scores.returns, self.scores.moments])
+
+
+def _look(evaluator: CandidateEvaluator, linear: ResidualAgent, most: int, seconds: float) -> _Look:
+    """Take some steps with constant actions, for as long as there is time.
+
+    Raises:
+        ConfigError: If the first step always fails.
+    """
+    rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, linear.acting)))
+    few, seeds = rows[:_ACTIONS], range(_EPISODES)
+    steps = max(1, min(_STEPS, most // (_ACTIONS * _EPISODES)))
+    if seconds < np.inf:
+        evaluator.play(linear, few, seeds)
+        needed = most * evaluator.seconds / evaluator.steps
+        steps = steps if needed <= seconds else max(_TRIED, int(steps * seconds / needed))
+    evaluator.count_anew(steps)
+    scores = evaluator.play(linear, few, seeds, has_moments=True)
+    if evaluator.steps == scores.costs[..., -1].sum():
+        raise ConfigError(
+            f"the first step fails, whatever the action: {evaluator.infos['fault'][0]}; "
+            "'fmugym validate' tells more"
+        )
+    is_quick = evaluator.seconds < _QUICK * evaluator.steps
+    if most == MOST_PROBED and steps == _STEPS and is_quick:
+        evaluator.count_anew(_TIMED)
+        evaluator.play(linear, rows, seeds)
+    return _Look(scores, evaluator.seconds / evaluator.steps, evaluator.longest, steps)
+
+
+def _warn(declared: _Declarations, scores: CandidateScores, tell: Callable[[str], None]) -> None:
+    """Tell of rewards that no action changes, and of episodes without a length."""
+    if np.ptp(scores.returns) == 0:
+        tell(
+            f"warning: all episodes have reached {scores.returns[0, 0]:g}, whatever the "
+            "actions: what is to be learned?"
+        )
+    if declared.length is None:
+        tell(f"warning: episodes have no length; they are stopped after {MOST_STEPS} steps")
 
 
 def _declared(
