@@ -9,7 +9,7 @@ from fmu_tools import PlainEnv, edited_fmu
 from scipy import stats
 
 import fmugym
-from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform, errors
+from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform
 from fmugym.environment import fmu_variables
 from fmugym.environment.env_checker import check_fmu_env
 
@@ -216,14 +216,18 @@ class TestTruncated:
         with pytest.raises(ConfigError, match="Stuck"):
             make(c=Stuck()).reset(seed=0)
 
-    def test_the_log_says_so_once(self, make, text, caplog, monkeypatch):
-        monkeypatch.setattr(errors, "_warned", set())
+    def test_the_log_says_so_once(self, make, text, caplog, tmp_path):
+        """The FMU has limits of its own, of which no other test lets the log tell."""
+        own = {'min="0" nominal="0.001"': 'min="0" max="77"', 'max="1000"': 'max="777"'}
+        fmu = edited_fmu(FMU, tmp_path, own)
+        task = text('{distribution = "normal", mean = 1, std = 1}')
+        task.write_text(task.read_text().replace('{bundled = "Pendulum"}', f'"{fmu.as_posix()}"'))
         with caplog.at_level(logging.WARNING):
             for _ in range(2):
-                make(c=stats.norm(0.5, 0.25)).reset(seed=0)
-                fmugym.load(text('{distribution = "normal", mean = 1, std = 1}')).close()
-            make(g=Normal(10, 1), m=Normal(0.5, 0.1, low=0.1))
+                make(fmu=fmu, c=stats.norm(0.5, 0.25)).reset(seed=0)
+                fmugym.load(task).close()
+            make(fmu=fmu, g=Normal(10, 1), m=Normal(0.5, 0.1, low=0.1))
         told = [one.getMessage() for one in caplog.records if one.name == fmu_variables.__name__]
         assert len(told) == 2
-        assert re.search(FRICTION, told[0])
-        assert re.search(r"'g'.*0\.0 and 1000\.0", told[1])
+        assert re.search(r"'c'.*0\.0 and 77\.0 N\.m, the FMU's min and max", told[0])
+        assert re.search(r"'g'.*0\.0 and 777\.0", told[1])

@@ -456,7 +456,7 @@ class TestZoo:
 def test_records_have_a_limit_and_say_so(halfway):
     """What is kept of an episode without saved states cannot be saved if it is not whole."""
     env = halfway(fmi_version="1.0")
-    inputs = env.pool._spec.inputs
+    inputs = env.pool_spec.inputs
     env.pool.write(inputs, np.zeros((len(inputs), 1)))  # which no record has
     with pytest.raises(SimulationError, match="too long"):
         env.save_state()

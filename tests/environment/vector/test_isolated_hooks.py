@@ -175,7 +175,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
     """Whatever is asked of the native pool that runs the programs, nothing crashes."""
     envs = make(Short, 3)
     envs.reset(seed=0)
-    around = programs_for(envs.pool, envs.pool._spec)
+    around = programs_for(envs.pool, envs.prototype.pool_spec)
     actions = np.zeros((3, 1), np.float32)
     for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
         with pytest.raises(ValueError, match="not prepared"):

@@ -98,13 +98,20 @@ def test_numbers_of_environments_that_no_memory_holds(num_envs):
         FMUVectorEnv(Drawing, num_envs)
 
 
-def test_memory_that_runs_out_is_blamed_on_the_number(monkeypatch):
-    def fail(self, *given):
-        raise MemoryError
+def test_memory_that_runs_out_is_blamed_on_the_number(temp_root):
+    made = []
 
-    monkeypatch.setattr(FMUVectorEnv, "_set_up", fail)
+    class Large(Drawing):
+        def __init__(self):
+            made.append(self)
+            if len(made) == 3:
+                raise MemoryError
+            super().__init__()
+
     with pytest.raises(ConfigError, match="not enough memory for num_envs = 3"):
-        FMUVectorEnv(Drawing, 3)
+        FMUVectorEnv(Large, 3)
+    assert len(made) == 3
+    assert not list(temp_root.iterdir())
 
 
 BAD = (
