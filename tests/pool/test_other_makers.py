@@ -4,6 +4,7 @@ The FMUs are those that programs of other makers build, and a bundled one of eac
 """
 
 import functools
+import shutil
 
 import fresh
 import makers
@@ -12,7 +13,6 @@ import pytest
 from combinations import in_turn
 
 import fmugym
-from fmugym import errors
 from fmugym.fmi.bundled import FMI_VERSIONS, bundled_fmu
 from fmugym.pool import opening
 
@@ -101,12 +101,12 @@ def test_vector(make_fmu, name, way, make_envs):
             assert states == expected(path, name, drawn, length, index)
 
 
-def test_the_need_of_a_tool_is_told_once(make_fmu, caplog, monkeypatch):
-    """A search opens an FMU many times."""
-    monkeypatch.setattr(errors, "_warned", set())
+def test_the_need_of_a_tool_is_told_once(make_fmu, caplog, tmp_path):
+    """A search opens an FMU many times; no other test opens one of this name."""
+    path = shutil.copy(make_fmu("pythonfmu"), tmp_path / "Well.fmu")
     for _ in range(2):
-        MadeEnv(make_fmu("pythonfmu"), "pythonfmu").close()
-    assert caplog.text.count("Tank.fmu needs the tool that exported it to run") == 1
+        MadeEnv(path, "pythonfmu").close()
+    assert caplog.text.count("Well.fmu needs the tool that exported it to run") == 1
 
 
 def test_what_is_invalid_in_it_does_not_stop(make_fmu):

@@ -8,6 +8,7 @@ import contextlib
 import functools
 import logging
 import os
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,6 @@ from ways import in_way
 import fmugym
 from fmugym.environment.env_checker import check_fmu_env
 from fmugym.errors import ContractError
-from fmugym.pool import opening
 from fmugym.pool.native_pool import NativePool
 from fmugym.pool.pool_spec import PoolSpec, ResetMethod
 from fmugym.pool.trial.trial import examine
@@ -151,16 +151,15 @@ class TestEpisodes:
 
 
 @pytest.fixture
-def nothing_warned(monkeypatch):
-    """A process that has not warned of any FMU yet."""
-    monkeypatch.setattr(opening, "_told", set())
+def make_new(make_fmu, tmp_path):
+    """Make FMUs in a folder of their own, of which the log has not told yet."""
+    return lambda *quirk: Path(shutil.copy(make_fmu(*quirk), tmp_path))
 
 
 @cases
-@pytest.mark.usefixtures("nothing_warned")
-def test_verdict(make_fmu, version, quirk, caplog):
+def test_verdict(make_new, version, quirk, caplog):
     """What several instances need, and what the log tells."""
-    path = make_fmu(quirk.token, version)
+    path = make_new(quirk.token, version)
     envs = make_vector(path, quirk)
     env = envs.prototype
     spec, starts = env.pool_spec, env.episode_start.starts()
@@ -283,16 +282,14 @@ def test_inputs_stay_within_their_limits(make_fmu):
     assert np.all((np.array(rows) >= -0.5) & (np.array(rows) <= 0.25))
 
 
-@pytest.mark.usefixtures("nothing_warned")
-def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
-    env = QuirkEnv(make_fmu("noise"))
+def test_an_fmu_that_is_not_deterministic_is_told_apart(make_new, caplog):
+    env = QuirkEnv(make_new("noise"))
     assert "gives other values of y each time, even if it begins afresh" in caplog.text
     env.close()
 
 
-@pytest.mark.usefixtures("nothing_warned")
-def test_an_output_that_tells_the_processors_time_is_no_reason_for_processes(make_fmu, caplog):
-    path = make_fmu("tells its time")
+def test_an_output_that_tells_the_processors_time_is_no_reason_for_processes(make_new, caplog):
+    path = make_new("tells its time")
     make_vector(path, quirk_table.Quirk("tells its time", "")).close()
     assert "gives other values of calls each time" in caplog.text
     assert "disturb each other" not in caplog.text
@@ -302,11 +299,11 @@ def test_an_output_that_tells_the_processors_time_is_no_reason_for_processes(mak
     assert verdict.reset_method is ResetMethod.RESTORE
 
 
-@pytest.mark.usefixtures("nothing_warned")
-def test_many_environments_warn_once(make_fmu, caplog):
+def test_many_environments_warn_once(make_new, caplog):
     """A training makes environments again and again, for its evaluations."""
+    path = make_new("reset does nothing")
     for _ in range(3):
-        QuirkEnv(make_fmu("reset does nothing")).close()
+        QuirkEnv(path).close()
     warnings = [record for record in caplog.records if record.levelname == "WARNING"]
     assert len(warnings) == 1
     assert quirk_table.BAD_RESET in warnings[0].getMessage()
