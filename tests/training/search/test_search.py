@@ -268,7 +268,7 @@ class TestArena:
             first = len(opened)
             evaluator.play(pid, GAINS, SEEDS)
             assert len(opened) == first
-            assert evaluator._envs.num_envs == 15
+            assert evaluator.jobs.shape == (15,)
 
     def test_a_second_play_is_like_the_first(self):
         with closing(CandidateEvaluator(load())) as evaluator:
@@ -293,9 +293,15 @@ class TestArena:
                 for seed in SEEDS:
                     controller.reset()
                     lengths.append(episode(env, controller, seed)[2])
-        with closing(CandidateEvaluator(make, most_envs, limits={"effort": 1.0})) as evaluator:
+        made = []
+
+        def kept():
+            made.append(make())
+            return made[-1]
+
+        with closing(CandidateEvaluator(kept, most_envs, limits={"effort": 1.0})) as evaluator:
             outcome = evaluator.play(pid, GAINS, SEEDS)
-            stepped = evaluator._envs.health["steps"].sum()
+            stepped = sum(pool.health()["steps"].sum() for pool in pools_of(made))
         assert stepped == evaluator.steps == sum(lengths)
         assert len(set(lengths)) > 3
         expected, _ = played(load(), limits={"effort": 1.0})
@@ -492,6 +498,12 @@ def policy_with(form, env_of_one, seed=0, rows=None, baseline=None):
     return policy_of(form, rng.normal(size=shape), scale if count else UNSCALED, baseline)
 
 
+def features_of(policy):
+    """What the network of a policy for one environment got for its last decision."""
+    count = policy.agent.features
+    return policy.moments[1 : 1 + count, 0].copy()
+
+
 class TestPolicy:
     def test_without_weights_it_is_the_controller(self, env):
         policy, controller = ResidualPolicy(pid(GAINS[3:4])).bind(env), pid(GAINS[3:4]).bind(env)
@@ -533,31 +545,33 @@ class TestPolicy:
     @pytest.mark.parametrize("form", [form for form in FORMS if form.history])
     def test_history_by_hand(self, form):
         """The network gets each number, its change, its leaky mean, and the last action."""
-        env, seen = Stub(NUMBERS, ACTING[0]), []
+        env, seen, actions = Stub(NUMBERS, ACTING[0]), [], []
         policy = policy_with(form, env).bind(env)
-        policy._network = recording(policy._network, seen)
         observations = np.random.default_rng(2).uniform(-2, 2, (4, 3))
-        actions = [policy.act(row) for row in observations]
+        for row in observations:
+            actions.append(policy.act(row))
+            seen.append(features_of(policy))
         leaky, before, last = observations[0], observations[0], np.zeros(2)
         for row, action, features in zip(observations, actions, seen, strict=True):
             leaky = leaky + 0.05 * (row - leaky)
             expected = np.concatenate([row, row - before, leaky, last])
-            assert features[0] == pytest.approx(expected, rel=1e-12)
+            assert features == pytest.approx(expected, rel=1e-12)
             before, last = row, (action - [1.0, 20.0]) / [3.0, 10.0]
         policy.reset()
         policy.act(observations[3])
-        assert seen[-1][0].tolist() == [*observations[3], 0, 0, 0, *observations[3], 0, 0]
+        assert features_of(policy).tolist() == [*observations[3], 0, 0, 0, *observations[3], 0, 0]
 
     def test_history_of_choices_is_one_hot(self):
         env, seen = Stub(NUMBERS, ACTING[2]), []
         policy = policy_with(FORMS[1], env).bind(env)
-        policy._network = recording(policy._network, seen)
         action = policy.act(np.ones(3))
+        seen.append(features_of(policy))
         policy.act(np.ones(3))
+        seen.append(features_of(policy))
         told = [float(action[0] == n) for n in (0, 1)] + [
             float(action[1] == n) for n in range(-1, 3)
         ]
-        assert [one[0, -6:].tolist() for one in seen] == [[0.0] * 6, told]
+        assert [one[-6:].tolist() for one in seen] == [[0.0] * 6, told]
 
     def test_a_network_by_hand(self):
         env = Stub(NUMBERS, ACTING[0])
@@ -678,12 +692,25 @@ class TestMasks:
             decision_of(env, policy_with(FORMS[0], env))
 
 
-def recording(network, seen):
-    def call(features):
-        seen.append(features.copy())
-        return network(features)
+def pools_of(envs):
+    """The pools of those environments that are open; several may share one."""
+    pools = {}
+    for env in envs:
+        with suppress(fmugym.SimulationError):
+            pools[id(env.pool)] = env.pool
+    return pools.values()
 
-    return call
+
+class Followed:
+    """A policy whose features are kept."""
+
+    def __init__(self, policy, seen):
+        self.policy, self.seen = policy, seen
+
+    def act(self, *observed):
+        action = self.policy.act(*observed)
+        self.seen.append(features_of(self.policy))
+        return action
 
 
 class Chain(fmugym.FMUEnv):
@@ -744,11 +771,10 @@ def test_a_scale_is_that_of_all_features(env):
     assert np.array_equal(*scales)
     for weights in rows:
         policy = make(weights).bind(env)
-        policy._network = recording(policy._network, observed)
         for seed in SEEDS:
             policy.reset()
-            episode(env, policy, seed)
-    features = np.concatenate(observed)
+            episode(env, Followed(policy, observed), seed)
+    features = np.array(observed)
     assert len(features) == moments[0] < 40 * 12
     expected = np.stack([features.mean(axis=0), features.std(axis=0)])
     assert scales[0] == pytest.approx(expected)
