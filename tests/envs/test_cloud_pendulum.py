@@ -286,7 +286,7 @@ class TestOnTheLab:
         env = on_lab(Client(lab))
         env.reset()
         lab.clock.advance(2.5)
-        lab._settle(lab.clock.time())
+        assert lab.running == []
         observation, _, terminated, truncated, info = env.step(np.zeros(1, np.float32))
         assert (terminated, truncated) == (False, True)
         assert "no request for 2 s" in info["fault"]

@@ -218,11 +218,17 @@ class TestReadings:
 
 class TestFriction:
     def test_each_hardware_cell_draws_its_own(self):
-        with make_lab() as lab:
-            drawn = [cell._parameters["c"] for cell in lab._cells[:4]]
-        assert len(set(drawn)) == 4
-        assert min(drawn) >= Options.coulomb_friction[0] == 1.7e-3
-        assert max(drawn) <= Options.coulomb_friction[1] == 3.9e-3
+        """Each falls differently, and none as if it had less or more friction than there is."""
+        assert Options.coulomb_friction == (1.7e-3, 3.9e-3)
+        with ideal_lab(coulomb_friction=Options.coulomb_friction) as lab:
+            running = [experiment(lab, initial_position=[1.5]) for _ in range(4)]
+            lab.clock.advance(1.0)
+            fallen = [client.get_position(token) for client, token in running]
+        least, most = (
+            free_fall(1.5, [0.0, 1.0], friction)[0][-1] for friction in Options.coulomb_friction
+        )
+        assert len(set(fallen)) == 4
+        assert least <= min(fallen) < max(fallen) <= most
 
     def test_swing_dies_as_the_equation_says(self):
         with ideal_lab(coulomb_friction=(2e-3, 2e-3)) as lab:

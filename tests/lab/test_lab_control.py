@@ -5,7 +5,7 @@ import pytest
 from combinations import in_turn
 from lab_tools import experiment, ideal_lab, track
 
-from fmugym.lab import LabError
+from fmugym.lab import CellType, LabError
 
 DOUBLES = ["DoublePendulum", "Acrobot", "Pendubot"]
 
@@ -137,12 +137,11 @@ class TestLimits:
         client, token = experiment(lab)
         assert client.get_position(token) == 0.0
 
-    def test_a_fault_of_the_model_ends_the_session(self, lab):
-        client, token = experiment(lab)
-        cell = lab._cells[0]
-        cell._pool.inputs[:] = 0.0
-        cell.drive.torque[0] = float("nan")
-        cell.drive._limits[0] = float("nan")
-        lab.clock.advance(0.1)
-        with pytest.raises(LabError, match="the cell failed: "):
-            client.get_position(token)
+    def test_a_fault_of_the_model_ends_the_session(self):
+        """Such damping is too much for it as soon as the arm moves."""
+        with ideal_lab(parameters={CellType.SINGLE: {"b": 1e300}}) as lab:
+            client, token = experiment(lab, initial_position=[1.0])
+            lab.clock.advance(0.1)
+            with pytest.raises(LabError, match="the cell failed: "):
+                client.get_position(token)
+            assert lab.running == []
