@@ -14,6 +14,7 @@ from process_tools import posix_only
 
 from fmugym import FMU, FMULoadError, SimulationError
 from fmugym.fmi import fmu as fmu_module
+from fmugym.fmi.safe_zip import SafeZip
 from fmugym.pool import native_pool
 
 METHODS = ["reset", "instance", "library", "process"]
@@ -128,13 +129,13 @@ def test_a_failed_extraction_leaves_no_part_of_a_file(path, temp_root, monkeypat
     fmu = FMU(path)
     folder = fmu.extract()
     remove(folder, "resources")
-    extract = fmu._archive.extract
+    extract = SafeZip.extract
 
-    def interrupted(to, files, folders=()):
-        extract(to, files, folders)
+    def interrupted(archive, to, files, folders=()):
+        extract(archive, to, files, folders)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fmu._archive, "extract", interrupted)
+    monkeypatch.setattr(SafeZip, "extract", interrupted)
     with pytest.raises(KeyboardInterrupt):
         fmu.extract()
     monkeypatch.undo()

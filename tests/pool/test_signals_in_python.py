@@ -149,12 +149,20 @@ def test_the_classes_of_fmpy(fmu, make, raised, monkeypatch):
 
 def test_what_an_mpc_plans_on(make, raised):
     """Its copies get the signal while a plan is played; afterwards they are as good as new."""
+    copies = []
+
+    def model():
+        copies.append(make(STEP)())
+        return copies[-1]
+
     with make(STEP)() as env:
-        mpc = fmugym.control.MPC("0.6s", candidates=16, rounds=2, budget=None).bind(env)
+        plans = {"candidates": 16, "rounds": 2, "budget": None, "model": model}
+        mpc = fmugym.control.MPC("0.6s", **plans).bind(env)
         observation, _ = env.reset(seed=0)
         with pytest.raises(raised[1]):
             mpc.act(observation)
-        assert not mpc._copies.health["errors"].any()
+        assert copies[0].pool.num_instances > 1
+        assert not copies[0].pool.health()["errors"].any()
         mpc.close()
 
 

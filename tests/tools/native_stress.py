@@ -129,6 +129,7 @@ class Subject:
             max_step=0.01,
             **options,
         )
+        self.spec = spec
         self.pool = NativePool(fmu, spec, self.n, log, threads=int(rng.integers(1, 5)))
         receiver.pool = self.pool
         self.rng = rng
@@ -231,7 +232,7 @@ class Subject:
             self.pool.restore_states([bundled[source] for source in sources], indices)
 
     def write(self):
-        self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))
+        self.pool.write(self.spec.inputs, np.zeros_like(self.pool.inputs))
 
     def forget(self):
         self.snapshot = None

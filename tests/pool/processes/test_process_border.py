@@ -28,10 +28,10 @@ class Impostor:
 
     def __init__(self, behave, end):
         self._end = end.dup()
-        self._thread = threading.Thread(target=self._run, args=(behave,), daemon=True)
+        self._thread = threading.Thread(target=self.run, args=(behave,), daemon=True)
         self._thread.start()
 
-    def _run(self, behave):
+    def run(self, behave):
         with contextlib.suppress(OSError, struct.error):  # the pool has closed its end
             self.read()
             self.send(Answer.RESULT)
@@ -135,7 +135,7 @@ def test_a_request_that_nobody_reads(deceived):
 
 
 def test_opening_is_answered_by_nothing_else(deceived, monkeypatch):
-    monkeypatch.setattr(Impostor, "_run", lambda self, _: self.send(Answer.TROUBLE))
+    monkeypatch.setattr(Impostor, "run", lambda self, _: self.send(Answer.TROUBLE))
     with pytest.raises(FMULoadError, match="has sent what is no answer in the instantiation"):
         deceived(None)
 

@@ -1,5 +1,6 @@
 """Rigs in the place of FMU instances: the pool of them, and environments over it."""
 
+import contextlib
 import gc
 import logging
 import re
@@ -294,12 +295,21 @@ def test_nothing_is_left_behind(kind, temp_root):
 
 def test_its_own_thread_may_close_a_pool():
     """As a finalizer does that happens to be called there."""
-    rig = Held()
+
+    class Closing(Held):
+        def step(self, inputs):
+            result = super().step(inputs)
+            pool.close()
+            return result
+
+    rig = Closing()
     env = RigEnv(rig)
     env.reset()
     pool = env.pool
-    pool._threads[0].ask(lambda _: pool.close(), None).result(10)
-    assert rig.calls == ["reset", "stop"]
+    with contextlib.suppress(SimulationError):  # it is closed
+        env.step(push(0.0))
+    assert rig.calls == ["reset", "step", "stop"]
+    assert threading.main_thread() not in rig.threads
     env.close()
 
 

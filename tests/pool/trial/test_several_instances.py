@@ -19,7 +19,6 @@ from test_quirks import QuirkEnv
 
 import fmugym
 from fmugym.pool.pool_spec import PoolSpec
-from fmugym.pool.trial import trial as trials_of_fmus
 from fmugym.pool.trial.trial import compare, examine
 from fmugym.pool.trial.verdict import Neighbours, Verdict, known_verdict
 
@@ -128,23 +127,6 @@ class TestOtherInstances:
         assert not Verdict(neighbours=Neighbours.INDEPENDENT, instances=2).covers(None, 3)
 
 
-class Trials(list):
-    """The lengths for which FMUs were tried."""
-
-
-@pytest.fixture
-def tried(monkeypatch):
-    lengths = Trials()
-
-    class Trial(trials_of_fmus._Trial):
-        def __init__(self, fmu, spec, starts, length):
-            super().__init__(fmu, spec, starts, length)
-            lengths.append(length)
-
-    monkeypatch.setattr(trials_of_fmus, "_Trial", Trial)
-    return lengths
-
-
 class TestLength:
     """The longest episode of a trial is as long as those of the task."""
 
@@ -161,28 +143,34 @@ class TestLength:
         finding = " ".join(known_verdict(env.fmu).findings)
         assert "do not give the outputs of a fresh instance: in the episode after" in finding
 
-    def test_a_longer_task_asks_for_another_trial(self, make_fmu, tried):
+    def test_a_longer_task_asks_for_another_trial(self, make_fmu, own_trials):
         fmu = fmugym.FMU(make_fmu("long memory", 3))
         found = [
-            str(examine(fmu, spec_of(fmu), length=length).reset_method)
-            for length in (50, 40, 1100, 1000)
+            (str(verdict.reset_method), verdict.length)
+            for verdict in (examine(fmu, spec_of(fmu), length=n) for n in (50, 40, 1100, 1000))
         ]
-        assert found == ["restore", "restore", "instance", "instance"]
-        assert tried == [50, 1100]
+        assert found == [("restore", 50), ("restore", 50), ("instance", 1100), ("instance", 1100)]
 
-    def test_what_the_fmu_ends_is_tried_once(self, make_fmu, tried):
-        fmu = fmugym.FMU(make_fmu("stops, reset keeps that"))
+    def test_what_the_fmu_ends_is_tried_once(self, make_fmu, own_trials, caplog):
+        caplog.set_level(logging.INFO, "fmugym")
+        fmu, told = fmugym.FMU(make_fmu("stops, reset keeps that")), []
         for length in (100, 1000, None):
             assert examine(fmu, spec_of(fmu), length=length).length is None
-        assert tried == [100]
+            told.append(len(caplog.records))
+        assert told[0] > 0
+        assert told == [told[0]] * 3
 
-    def test_it_is_that_of_the_config_the_arguments_or_the_stop_time(self, make_fmu, tried):
-        path = make_fmu("well behaved")
+    def test_it_is_that_of_the_config_the_arguments_or_the_stop_time(self, make_fmu, own_trials):
+        path, found = make_fmu("well behaved"), []
+        fmu = fmugym.FMU(path)
         QuirkEnv(path, time_step=0.02, max_episode_steps=70).close()
+        found.append(known_verdict(fmu).length)
         QuirkEnv(path, time_step=0.02, stop_time=1.5).close()
+        found.append(known_verdict(fmu).length)
         make = lambda: QuirkEnv(path, time_step=0.04)  # noqa: E731
         fmugym.FMUVectorEnv(make, 2, max_episode_steps=80).close()
-        assert tried == [70, 75, 80]
+        found.append(known_verdict(fmu).length)
+        assert found == [70, 75, 80]
 
 
 EARLY = """

@@ -23,7 +23,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.processes import launcher
 from fmugym.pool.processes.channel import describe_exit
-from fmugym.pool.trial import trial, trial_workers
+from fmugym.pool.trial import trial
 from fmugym.pool.trial.verdict import known_verdict
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="its faults are those of Unix")
@@ -114,9 +114,8 @@ class TestDeath:
         assert processes_with(temp_root) == []
 
     @pytest.mark.parametrize("token", ["hang in a later step", "hang in a later reset"])
-    def test_a_hang_after_quick_calls_ends_soon(self, make_fmu, token, monkeypatch):
+    def test_a_hang_after_quick_calls_ends_soon(self, make_fmu, token):
         """Its limit follows from the calls before."""
-        monkeypatch.setattr(trial_workers, "_LEAST", 1.0)
         path, start = make_fmu(token), time.monotonic()
         PlainEnv(path, CONFIG).close()
         assert time.monotonic() - start < 40.0
