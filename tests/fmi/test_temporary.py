@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from fmugym import FMU, FMULoadError
 from fmugym.fmi import temporary
+from fmugym.fmi.safe_zip import SafeZip
 from fmugym.fmi.temporary import folder_name, is_plain_path
 
 each_root = pytest.mark.parametrize(
@@ -76,15 +77,15 @@ def test_the_folder_goes(tmp_path, use, name):
 def test_nobody_removes_it_while_files_are_extracted(tmp_path, monkeypatch):
     """Several threads may use one FMU, of which one closes it."""
     fmu, alive = FMU(resource_fmu(tmp_path, 2)), []
-    closing, extract_to = threading.Thread(target=fmu.close), fmu._extract_to
+    closing, extract = threading.Thread(target=fmu.close), SafeZip.extract
 
-    def slow(folder, only=""):
+    def slow(*arguments):
         closing.start()
         closing.join(0.2)
         alive.append(closing.is_alive())
-        return extract_to(folder, only)
+        extract(*arguments)
 
-    monkeypatch.setattr(fmu, "_extract_to", slow)
+    monkeypatch.setattr(SafeZip, "extract", slow)
     folder = fmu.extract()
     closing.join()
     assert alive == [True]
