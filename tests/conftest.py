@@ -6,6 +6,7 @@ import functools
 import gc
 import importlib
 import os
+import re
 import sys
 import tempfile
 
@@ -175,6 +176,24 @@ def cli(capsys):
         return code, *capsys.readouterr()
 
     return call
+
+
+@pytest.fixture
+def help_of(capsys):
+    """What ``--help`` prints for the command line, or for one of its commands."""
+
+    def call(*command):
+        with pytest.raises(SystemExit):
+            run_command_line([*command, "--help"])
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def commands(help_of):
+    """The names of all commands."""
+    return set(re.findall(r"^    ([\w-]+)  ", help_of(), re.M))
 
 
 @pytest.fixture
