@@ -284,7 +284,7 @@ class TestCourse:
         for content in damaged:
             state.write_bytes(content)
             with pytest.raises(fmugym.ConfigError, match="no search to resume"):
-                Searching(None, {}, folder)._resumed()
+                Searching(None, {}, folder).run(resume=True)
         code, _, err = cli("train", task, "--output", folder, "--resume")
         assert (code, err.count("\n")) == (1, 1)
 

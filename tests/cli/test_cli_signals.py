@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from process_tools import faulty_fmu, start_values
 
 import fmugym
 from fmugym import __main__ as program
-from fmugym.cli import signals
+from fmugym.cli.signals import SignalledEnd
 from fmugym.control.candidate_evaluation import CandidateEvaluator
 from fmugym.training import search_training, training_report
 from fmugym.training.search.policy_search import Search
@@ -131,11 +130,14 @@ MOMENTS = {
 }
 
 
+def end(number, frame):
+    raise SignalledEnd(number)
+
+
 @pytest.fixture(params=[signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def number(request, monkeypatch):
+def number(request):
     """A signal that ends commands."""
-    monkeypatch.setattr(signals, "_begun", threading.Event())
-    before = signal.signal(request.param, signals._raise)
+    before = signal.signal(request.param, end)
     yield request.param
     signal.signal(request.param, before)
 
@@ -191,8 +193,7 @@ def test_while_modules_are_loaded(monkeypatch):
         os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(program, "end_as_after_ctrl_c", signalled)
-    monkeypatch.setattr(signals, "_begun", threading.Event())
-    before = signal.signal(signal.SIGTERM, signals._raise)
+    before = signal.signal(signal.SIGTERM, end)
     try:
         assert program.main() == 143
     finally:
