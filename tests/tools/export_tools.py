@@ -183,25 +183,25 @@ class CompiledAgent:
         self.agent = agent
         self._init = library[f"{agent.name}_init"]
         self._step = library[f"{agent.name}_step"]
-        self._state = ctypes.create_string_buffer(8 + 16 * 8 * 4096)
+        self.memory = ctypes.create_string_buffer(8 + 16 * 8 * 4096)
         self._actions = (ctypes.c_double * len(agent.logic.inputs))()
 
     def begin(self, **parameters):
         """Begin an episode, with parameters set as a user of the struct would."""
-        self._init(self._state)
+        self._init(self.memory)
         assert all(one.dtype.itemsize == 8 for one in self.agent.logic.kept) or not parameters
         for parameter in self.agent.logic.parameters:
             if parameter.name in parameters:
                 before = self.agent.logic.kept[: parameter.field]
                 place = 8 + 8 * (sum(len(one.starts) for one in before) + parameter.element)
-                value = ctypes.c_double.from_buffer(self._state, place)
+                value = ctypes.c_double.from_buffer(self.memory, place)
                 assert value.value == parameter.start
                 value.value = parameters[parameter.name]
 
     def step(self, measurements):
         """The actions, or None if the agent has refused the measurements."""
         numbers = (ctypes.c_double * len(measurements))(*measurements)
-        if self._step(self._state, numbers, self._actions):
+        if self._step(self.memory, numbers, self._actions):
             return None
         return list(self._actions)
 

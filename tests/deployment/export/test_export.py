@@ -459,9 +459,9 @@ class TestFiles:
         env.close()
         controller.begin()
         controller.step([293.0])
-        before = controller._state.raw
+        before = controller.memory.raw
         assert controller.step([bad]) is None
-        assert controller._state.raw == before
+        assert controller.memory.raw == before
 
 
 class TestFunctions:

@@ -271,14 +271,17 @@ class TestInC(Agents):
 
     def test_of_a_controller_in_python(self, tmp_path):
         env, texts = heater({"agent": PRESENT}), []
-        policy = ResidualAgent("by hand", HEAT).policy().bind(env)
-        policy.act(np.array([20.0, 1.0]))
+        policy, other = (ResidualAgent("by hand", HEAT).policy().bind(env) for _ in range(2))
+        for one in (policy, other):
+            one.act(np.array([20.0, 1.0]))
         for model in (policy, controller_from(HEAT), ResidualAgent("by hand", HEAT)):
             folder = tmp_path / str(len(texts))
             folder.mkdir()
             texts.append(write_c(agent_of(env, model), folder)[1].read_text())
         assert texts[0] == texts[1] == texts[2]
-        assert policy.baseline._state[1] == 20.0  # it is as before
+        for measured in (20.5, 20.2):  # it goes on as if nothing had been written
+            seen = np.array([measured, 1.0])
+            assert policy.act(seen).tolist() == other.act(seen).tolist()
         env.close()
 
 
