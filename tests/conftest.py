@@ -16,6 +16,7 @@ import fmu_tools
 import pytest
 import tiers
 import wine_tools
+from hypothesis import HealthCheck, settings
 from ways import in_python, many
 
 import fmugym
@@ -34,6 +35,19 @@ if building.FOLDER not in os.environ:
 # Nearly every test makes an FMU that nobody has met; test_trial.py turns their trials on.
 os.environ["FMUGYM_PROBE"] = "off"
 os.environ["FMUGYM_CACHE_DIR"] = os.path.join(os.environ[building.FOLDER], "cache")
+
+# Tests of Hypothesis have the same examples in each run. --hypothesis-profile long draws others.
+settings.register_profile(
+    "short",
+    deadline=None,
+    derandomize=True,
+    report_multiple_bugs=False,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.register_profile(
+    "long", settings.get_profile("short"), max_examples=1000, derandomize=False
+)
+settings.load_profile("short")
 
 
 def pytest_ignore_collect(collection_path, config):

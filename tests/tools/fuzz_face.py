@@ -13,12 +13,12 @@ import itertools
 import math
 import sys
 
+import fuzz_odd_values as odd_values
 import gymnasium
 import numpy as np
-import odd_values
 from fmu_tools import PlainEnv
 from fuzz_driver import Case, describe, main
-from odd_values import hostile
+from fuzz_odd_values import hostile
 from ways import in_way
 
 import fmugym

@@ -15,7 +15,7 @@ import sys
 import gymnasium
 import numpy as np
 from fuzz_driver import Case, main, require
-from odd_values import odd
+from fuzz_odd_values import odd
 from vector_tools import Drawing
 from ways import in_way
 

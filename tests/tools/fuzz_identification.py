@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 from fuzz_driver import main, of_kinds
-from odd_values import odd, spoil
+from fuzz_odd_values import odd, spoil
 
 from fmugym import bundled_fmu
 from fmugym.control.identification import Trajectory, fit_parameters, plot_comparison

@@ -1,16 +1,62 @@
-"""Odd values for the programs that call public functions with them, such as ``fuzz_face.py``."""
+"""Odd values as strategies of Hypothesis, and the rule for calls that get them.
 
+A call with odd values works, or is refused with an error of the package.
+"""
+
+import contextlib
 import datetime
 import decimal
 import enum
 import fractions
 import itertools
+import logging
+import os
 import sys
+import tempfile
+import warnings
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
+from hypothesis import strategies as st
 
-# Odd values
+from fmugym import FMUGymError
+
+LONG = 2000
+"""More characters than the text of an error may have."""
+
+
+@contextlib.contextmanager
+def working_or_refused():
+    """Let calls in an empty working directory work, or raise an error of the package.
+
+    Its text is short, a terminal prints it as it stands, and no temporary file is left.
+    """
+    with tempfile.TemporaryDirectory() as empty, tempfile.TemporaryDirectory() as temporary:
+        with contextlib.chdir(empty), mock.patch.object(tempfile, "tempdir", temporary), quiet():
+            try:
+                yield
+            except FMUGymError as error:
+                require_plain_text(error)
+        assert os.listdir(temporary) == []
+
+
+def require_plain_text(error):
+    text = str(error)
+    assert len(text) < LONG
+    assert all(map(str.isprintable, text.split("\n"))), ascii(text)  # a line for each mistake
+
+
+@contextlib.contextmanager
+def quiet():
+    """Without log messages and warnings, which odd values bring about by the thousand."""
+    logging.disable(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 class Unspeakable:
@@ -32,8 +78,8 @@ def _refuse(*arguments, **keywords):
     raise HostileError("do not touch me")
 
 
-def hostile(*names, base=object):
-    """Make an object whose special methods of these names raise."""
+def hostile(names, base=object):
+    """Make an object whose methods of these names raise."""
     return type("Hostile", (base,), dict.fromkeys(names, _refuse))()
 
 
@@ -75,79 +121,77 @@ class Colour(enum.Enum):
     RED = 1
 
 
-NUMBERS = (
-    *(None, True, 0, 0.0, -0.0, -1, 1, 7, -1e-300, 1e-320, 1e308, -1e308, 10**400, -(10**400)),
-    *(2**31, 2**63, 2**64, float("nan"), float("inf"), -float("inf"), 1j, Slippery(2.0)),
-    *(Slippery("nan"), decimal.Decimal("1.5"), decimal.Decimal("sNaN"), fractions.Fraction(1, 3)),
-    *(np.float32(0.1), np.float64("nan"), np.int8(-3), np.uint64(2**64 - 1), np.bool_(True)),
-    *(np.datetime64("2020-01-01"), np.timedelta64(1, "s"), datetime.timedelta(seconds=1)),
-    *(2, 3, 2**53 + 1, 10**5000, 0.1, 0.5, 1.5, 1e-9, np.float16(1), np.complex64(1), Whole(2)),
-    *(np.longdouble("1e4000"), decimal.Decimal("1e9999"), fractions.Fraction(10**400)),
+METHODS = (
+    *("__repr__", "__str__", "__float__", "__index__", "__int__", "__array__", "__eq__"),
+    *("__bool__", "__hash__", "__len__", "__iter__", "__getattr__", "__getitem__"),
+    *("__fspath__", "__deepcopy__"),
 )
-TEXTS = (
-    *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum", "None"),
-    *("\0", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5", bytearray(b"5")),
-    *(OddText("5"), OddText("SimplePendulum"), "ideal", "hardware", "rgb_array", "../x"),
-    *("tau", "q_0", "q", "rk4", "process", "human", "\u00e4\u4e2d", memoryview(b"1"), Colour.RED),
-)
-GROUPS = (
-    *((), [], {}, set(), frozenset([1]), [1], [1.0, 2.0], (None,), [None, None], [[1]], [[]]),
-    *([[1], [2, 3]], {"a": 1}, {1: 2}, ["up"], [float("nan")], [10**400]),
-    *([1] * 1000, ["a", "b"], [(0, 1), (1, 0), (1, 1)], (0.0, 1.0), (1.0, 0.5, 2.0, 3.0)),
-    *(range(3), range(10**12), np.zeros(2), np.zeros((2, 2)), np.array(1.0), np.array(["a"])),
-    *(np.array([], float), np.ma.masked, np.array([None]), np.zeros(1, [("a", "f8")])),
-)
-OTHERS = (
-    *(object(), Unspeakable(), Unspeakable, type, len, lambda *_: None, Ellipsis, NotImplemented),
-    *(Path("x"), ValueError("a value"), sys, datetime.datetime(2020, 1, 1)),
-)
-MAKERS = (
-    *(circular, lambda: iter([1.0]), lambda: itertools.repeat(1.0), lambda: [circular()]),
-    *(lambda: (1 / 0 for _ in range(2)), lambda: [Unspeakable()], lambda: {"a": Unspeakable()}),
-    lambda: hostile("__repr__"),
-    lambda: hostile("__repr__", "__str__"),
-    lambda: hostile(),
-    lambda: hostile("__float__"),
-    lambda: hostile("__index__"),
-    lambda: hostile("__int__"),
-    lambda: hostile("__array__"),
-    lambda: hostile("__eq__"),
-    lambda: hostile("__bool__"),
-    lambda: hostile("__hash__"),
-    lambda: hostile("__len__"),
-    lambda: hostile("__iter__"),
-    lambda: hostile("__getattr__"),
-    lambda: hostile("__getitem__", "__len__"),
-    lambda: hostile("__fspath__"),
-    lambda: hostile("__deepcopy__"),
-    lambda: hostile("__eq__", "__bool__", "__repr__", "__array__", "__float__", "__len__"),
-    lambda: hostile("__repr__", base=float),
-    lambda: hostile("__float__", base=float),
-    lambda: hostile("__repr__", "__eq__", "__index__", "__float__", base=int),
-    lambda: hostile("__iter__", "__len__", base=list),
-    lambda: hostile("keys", base=dict),
-    lambda: hostile("__iter__", "items", base=dict),
-    lambda: hostile("__hash__", base=str),
-)
-
-
-def odd(rng, others=()):
-    """Draw an odd value.
-
-    Args:
-        rng: What is drawn.
-        others: More odd values; functions without arguments make new ones.
-    """
-    group = rng.choice(
-        (NUMBERS, NUMBERS, TEXTS, TEXTS, GROUPS, GROUPS, OTHERS, MAKERS, others or TEXTS)
+NUMBERS = st.sampled_from(
+    (
+        *(None, True, 0, 0.0, -0.0, -1, 1, 7, -1e-300, 1e-320, 1e308, -1e308, 10**400, -(10**400)),
+        *(2**31, 2**63, 2**64, float("nan"), float("inf"), -float("inf"), 1j),
+        *(decimal.Decimal("1.5"), decimal.Decimal("sNaN"), decimal.Decimal("1e9999")),
+        *(np.float32(0.1), np.float64("nan"), np.int8(-3), np.uint64(2**64 - 1), np.bool_(True)),
+        *(np.datetime64("2020-01-01"), np.timedelta64(1, "s"), datetime.timedelta(seconds=1)),
+        *(2, 3, 2**53 + 1, 10**5000, 0.1, 0.5, 1.5, 1e-9, np.float16(1), np.complex64(1)),
+        *(Whole(2), np.longdouble("1e4000"), fractions.Fraction(1, 3), fractions.Fraction(10**400)),
     )
-    value = rng.choice(group)
-    is_maker = group is MAKERS or getattr(value, "__name__", "") == "<lambda>"
-    return value() if is_maker else value
+) | st.builds(Slippery, st.sampled_from((2.0, float("nan"))))
+TEXTS = st.sampled_from(
+    (
+        *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum"),
+        *("None", "\0", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5"),
+        *("ideal", "hardware", "rgb_array", "../x", "tau", "q_0", "q", "rk4", "process", "human"),
+        *("\u00e4\u4e2d", bytearray(b"5"), memoryview(b"1"), Colour.RED),
+    )
+)
+GROUPS = st.sampled_from(
+    (
+        *((), [], {}, set(), frozenset([1]), [1], [1.0, 2.0], (None,), [None, None], [[1]], [[]]),
+        *([[1], [2, 3]], {"a": 1}, {1: 2}, ["up"], [float("nan")], [10**400]),
+        *([1] * 1000, ["a", "b"], [(0, 1), (1, 0), (1, 1)], (0.0, 1.0), (1.0, 0.5, 2.0, 3.0)),
+        *(range(3), range(10**12), np.zeros(2), np.zeros((2, 2)), np.array(1.0), np.array(["a"])),
+        *(np.array([], float), np.ma.masked, np.array([None]), np.zeros(1, [("a", "f8")])),
+    )
+)
+OBJECTS = st.sampled_from(
+    (
+        *(object(), type, len, lambda *_: None, Ellipsis, NotImplemented, Path("x"), sys),
+        *(Unspeakable, ValueError("a value"), datetime.datetime(2020, 1, 1)),
+    )
+)
+UNSPEAKABLE = st.builds(Unspeakable)
+HOSTILE = st.one_of(
+    UNSPEAKABLE,
+    UNSPEAKABLE.map(lambda one: [one]),
+    UNSPEAKABLE.map(lambda one: {"a": one}),
+    st.builds(circular),
+    st.builds(iter, st.just([1.0])),
+    st.builds(lambda: (1 / 0 for _ in range(2))),
+    st.builds(hostile, st.lists(st.sampled_from(METHODS), max_size=4, unique=True)),
+    st.builds(hostile, st.just(["__repr__"]), st.sampled_from((float, int))),
+    st.builds(hostile, st.just(["__float__"]), st.sampled_from((float, int))),
+    st.builds(hostile, st.just(["__iter__"]), st.sampled_from((list, dict))),
+    st.builds(hostile, st.sampled_from((["keys"], ["items"])), st.just(dict)),
+    st.builds(hostile, st.just(["__hash__"]), st.just(str)),
+)
+UNUSABLE = st.builds(OddText, st.sampled_from(("5", "SimplePendulum"))) | st.builds(
+    itertools.repeat, st.just(1.0)
+)
+"""Texts that cannot be looked up, and an iterator without an end: where nobody looks or counts."""
+
+WITH_AN_END = NUMBERS | TEXTS | GROUPS | OBJECTS | HOSTILE
+ODD = WITH_AN_END | UNUSABLE
 
 
-def spoil(rng, arguments, others=()):
-    """Replace one or two values of a dict of arguments by odd ones."""
-    places = sorted(arguments)
-    chosen = rng.sample(places, min(len(places), rng.choice((1, 1, 1, 2))))
-    return arguments | {place: odd(rng, others) for place in chosen}
+def spoiled(arguments, values=ODD):
+    """A strategy of the arguments of a call, of which one or two are odd."""
+    odd = st.dictionaries(st.sampled_from(sorted(arguments)), values, min_size=1, max_size=2)
+    return odd.map(lambda chosen: arguments | chosen)
+
+
+@st.composite
+def odd_calls(draw, calls):
+    """A strategy of a function of ``calls`` and its arguments, of which one or two are odd."""
+    function, arguments = calls[draw(st.sampled_from(sorted(calls)))]
+    return function, draw(spoiled(arguments))

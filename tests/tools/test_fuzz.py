@@ -7,7 +7,6 @@ import fuzz
 import fuzz_driver
 import fuzz_face
 import fuzz_identification
-import fuzz_rendering
 import pytest
 from fuzz_driver import Case, CaseError
 
@@ -17,7 +16,6 @@ ODD = {
     fuzz: (400, 20),
     fuzz_face: (700, 30),
     fuzz_identification: (400, 10),
-    fuzz_rendering: (300, 5),
 }
 """By program: how many cases, and how many are accepted, and refused, at least."""
 
