@@ -59,7 +59,14 @@ def quiet():
         logging.disable(logging.NOTSET)
 
 
-class Unspeakable:
+class Named:
+    """An object that Hypothesis shows by the name of its class, whatever its ``repr`` does."""
+
+    def _repr_pretty_(self, printer, cycle):
+        printer.text(type(self).__name__)
+
+
+class Unspeakable(Named):
     """An object that can be neither shown, compared, counted nor converted."""
 
     def _refuse(self, *arguments):
@@ -80,7 +87,8 @@ def _refuse(*arguments, **keywords):
 
 def hostile(names, base=object):
     """Make an object whose methods of these names raise."""
-    return type("Hostile", (base,), dict.fromkeys(names, _refuse))()
+    name = f"hostile({names}, {base.__name__})"
+    return type(name, (Named, base), dict.fromkeys(names, _refuse))()
 
 
 def circular():
@@ -90,7 +98,7 @@ def circular():
     return values
 
 
-class Slippery(float):
+class Slippery(Named, float):
     """A float that cannot be shown."""
 
     def __repr__(self):
@@ -99,10 +107,8 @@ class Slippery(float):
     __str__ = __format__ = __repr__
 
 
-class OddText(str):
+class OddText(Named, str):
     """A text that cannot be looked up."""
-
-    __slots__ = ()
 
     def __hash__(self):
         raise ZeroDivisionError("this text has no hash")
@@ -157,7 +163,7 @@ GROUPS = st.sampled_from(
 OBJECTS = st.sampled_from(
     (
         *(object(), type, len, lambda *_: None, Ellipsis, NotImplemented, Path("x"), sys),
-        *(Unspeakable, ValueError("a value"), datetime.datetime(2020, 1, 1)),
+        *(object, ValueError("a value"), datetime.datetime(2020, 1, 1)),
     )
 )
 UNSPEAKABLE = st.builds(Unspeakable)
