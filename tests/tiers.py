@@ -32,7 +32,6 @@ SLOW_MODULES = {
     "test_export_search",
     "test_fuzz",
     "test_fuzz_forms",
-    "test_fuzz_hooks",
     "test_fuzz_systems",
     "test_guessing",
     "test_keys_in_editors",
@@ -45,6 +44,7 @@ SLOW_MODULES = {
     "test_negated_aliases",
     "test_neighbours",
     "test_order_of_step",
+    "test_odd_hooks",
     "test_packaging",
     "test_pendulum_sim_to_lab",
     "test_pettingzoo",
@@ -343,7 +343,6 @@ EXHAUSTIVE_TESTS = (
     "test_benchmarks.py::test_heavy_steps",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[prothero",
     "test_soak.py",
-    "test_fuzz_hooks.py",
 )
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 

@@ -98,6 +98,11 @@ def circular():
     return values
 
 
+def failing():
+    """Make an iterator that fails."""
+    return (1 / 0 for _ in range(2))
+
+
 class Slippery(Named, float):
     """A float that cannot be shown."""
 
@@ -117,8 +122,13 @@ class OddText(Named, str):
         raise ZeroDivisionError("this text has no equal")
 
 
-class Whole(int):
+class Whole(Named, int):
     """An integer of a class of the caller's."""
+
+
+def huge():
+    """Make an integer that is too long for a text."""
+    return Whole(10**5000)
 
 
 class Colour(enum.Enum):
@@ -139,10 +149,10 @@ NUMBERS = st.sampled_from(
         *(decimal.Decimal("1.5"), decimal.Decimal("sNaN"), decimal.Decimal("1e9999")),
         *(np.float32(0.1), np.float64("nan"), np.int8(-3), np.uint64(2**64 - 1), np.bool_(True)),
         *(np.datetime64("2020-01-01"), np.timedelta64(1, "s"), datetime.timedelta(seconds=1)),
-        *(2, 3, 2**53 + 1, 10**5000, 0.1, 0.5, 1.5, 1e-9, np.float16(1), np.complex64(1)),
+        *(2, 3, 2**53 + 1, 10**4000, 0.1, 0.5, 1.5, 1e-9, np.float16(1), np.complex64(1)),
         *(Whole(2), np.longdouble("1e4000"), fractions.Fraction(1, 3), fractions.Fraction(10**400)),
     )
-) | st.builds(Slippery, st.sampled_from((2.0, float("nan"))))
+)
 TEXTS = st.sampled_from(
     (
         *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum"),
@@ -167,27 +177,26 @@ OBJECTS = st.sampled_from(
     )
 )
 UNSPEAKABLE = st.builds(Unspeakable)
-HOSTILE = st.one_of(
-    UNSPEAKABLE,
-    UNSPEAKABLE.map(lambda one: [one]),
-    UNSPEAKABLE.map(lambda one: {"a": one}),
-    st.builds(circular),
-    st.builds(iter, st.just([1.0])),
-    st.builds(lambda: (1 / 0 for _ in range(2))),
-    st.builds(hostile, st.lists(st.sampled_from(METHODS), max_size=4, unique=True)),
-    st.builds(hostile, st.just(["__repr__"]), st.sampled_from((float, int))),
-    st.builds(hostile, st.just(["__float__"]), st.sampled_from((float, int))),
-    st.builds(hostile, st.just(["__iter__"]), st.sampled_from((list, dict))),
-    st.builds(hostile, st.sampled_from((["keys"], ["items"])), st.just(dict)),
-    st.builds(hostile, st.just(["__hash__"]), st.just(str)),
-)
-UNUSABLE = st.builds(OddText, st.sampled_from(("5", "SimplePendulum"))) | st.builds(
-    itertools.repeat, st.just(1.0)
-)
-"""Texts that cannot be looked up, and an iterator without an end: where nobody looks or counts."""
+HOSTILE = st.sampled_from(
+    (
+        *(UNSPEAKABLE, UNSPEAKABLE.map(lambda o: [o]), UNSPEAKABLE.map(lambda o: {"a": o})),
+        *(st.builds(circular), st.builds(iter, st.just([1.0])), st.builds(failing)),
+        *(st.builds(Slippery, st.sampled_from((2.0, float("nan")))), st.builds(huge)),
+        st.builds(hostile, st.lists(st.sampled_from(METHODS), max_size=2, unique=True)),
+        st.builds(hostile, st.sampled_from((["__repr__"], ["__float__"])), st.just(float)),
+        st.builds(hostile, st.sampled_from((["__repr__"], ["__index__"])), st.just(int)),
+        st.builds(hostile, st.sampled_from((["__iter__"], ["__len__"])), st.just(list)),
+        st.builds(hostile, st.sampled_from((["__iter__"], ["keys"], ["items"])), st.just(dict)),
+        st.builds(hostile, st.just(["__hash__"]), st.just(str)),
+    )
+).flatmap(lambda kind: kind)
+ENDLESS = st.builds(itertools.repeat, st.just(1.0))
+WITHOUT_HASH = st.builds(OddText, st.sampled_from(("5", "SimplePendulum")))
 
-WITH_AN_END = NUMBERS | TEXTS | GROUPS | OBJECTS | HOSTILE
-ODD = WITH_AN_END | UNUSABLE
+USUAL = NUMBERS | TEXTS | GROUPS | OBJECTS | HOSTILE
+"""Odd values that can be counted, and of which texts can be looked up."""
+
+ODD = USUAL | ENDLESS | WITHOUT_HASH
 
 
 def spoiled(arguments, values=ODD):
