@@ -34,6 +34,7 @@ SLOW_MODULES = {
     "test_fuzz_forms",
     "test_fuzz_systems",
     "test_guessing",
+    "test_identification_odd_arguments",
     "test_keys_in_editors",
     "test_lab_programs",
     "test_licences",

@@ -156,7 +156,7 @@ NUMBERS = st.sampled_from(
 TEXTS = st.sampled_from(
     (
         *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum"),
-        *("None", "\0", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5"),
+        *("None", "\0", "\x1b[31m", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5"),
         *("ideal", "hardware", "rgb_array", "../x", "tau", "q_0", "q", "rk4", "process", "human"),
         *("\u00e4\u4e2d", bytearray(b"5"), memoryview(b"1"), Colour.RED),
     )

@@ -6,7 +6,6 @@ import time
 import fuzz
 import fuzz_driver
 import fuzz_face
-import fuzz_identification
 import pytest
 from fuzz_driver import Case, CaseError
 
@@ -15,7 +14,6 @@ from fmugym import ConfigError
 ODD = {
     fuzz: (400, 20),
     fuzz_face: (700, 30),
-    fuzz_identification: (400, 10),
 }
 """By program: how many cases, and how many are accepted, and refused, at least."""
 
