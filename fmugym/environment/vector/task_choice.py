@@ -146,7 +146,8 @@ def _make_all(maker: EnvMaker, prototype: FMUEnv, count: int) -> list[FMUEnv]:
     """Make the other environments; all but the prototype are closed if one cannot be made."""
     envs = [prototype]
     try:
-        envs.extend(maker.make_like(prototype, index) for index in range(1, count))
+        while len(envs) < count:
+            envs.append(maker.make_like(prototype, len(envs)))
     except BaseException:
         for env in envs[1:]:
             env.close()
