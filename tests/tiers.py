@@ -45,6 +45,7 @@ SLOW_MODULES = {
     "test_negated_aliases",
     "test_neighbours",
     "test_order_of_step",
+    "test_odd_arguments",
     "test_odd_hooks",
     "test_packaging",
     "test_pendulum_sim_to_lab",

@@ -5,7 +5,6 @@ import time
 
 import fuzz
 import fuzz_driver
-import fuzz_face
 import pytest
 from fuzz_driver import Case, CaseError
 
@@ -13,7 +12,6 @@ from fmugym import ConfigError
 
 ODD = {
     fuzz: (400, 20),
-    fuzz_face: (700, 30),
 }
 """By program: how many cases, and how many are accepted, and refused, at least."""
 
@@ -25,7 +23,7 @@ def test_what_is_odd_raises_nothing_but_our_own_errors(module, same_working_dire
     assert tally.failures == []
     assert tally.total("accepted") + tally.total("refused") == count
     assert min(tally.total("accepted"), tally.total("refused")) > least
-    if module in (fuzz, fuzz_face):
+    if module is fuzz:
         assert len({kind for kind, _ in tally.counts}) == len(module.KINDS)
 
 
