@@ -41,11 +41,12 @@ settings.register_profile(
     "short",
     deadline=None,
     derandomize=True,
+    print_blob=True,
     report_multiple_bugs=False,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.register_profile(
-    "long", settings.get_profile("short"), max_examples=1000, derandomize=False
+    "long", settings.get_profile("short"), max_examples=2000, derandomize=False
 )
 settings.load_profile("short")
 

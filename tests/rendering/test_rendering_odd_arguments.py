@@ -20,6 +20,7 @@ RED, HERE = (255, 0, 0), (0.0, 0.0)
 BOUNDS = {"left": -1.0, "bottom": -1.0, "right": 1.0, "top": 1.0}
 CANVAS = {"size": (40, 40), "world": World(**BOUNDS)}
 PENDULUM, FRAME, OVERLAY = PendulumScene(1.0), PendulumFrame(1.0), Overlay(0.0)
+RENDERER = {"scene": PENDULUM, "fps": 50.0, "size": (40, 40), "render_mode": "rgb_array"}
 
 
 def drawing(shape):
@@ -50,31 +51,22 @@ SHAPES = {
     "text": {"position": HERE, "text": "x", "size": 12, "anchor": "center"},
     "caption": {"pixel": (1, 1), "text": "x", "size": 12},
 }
-SHAPES = {shape: (drawing(shape), {**given, "color": RED}) for shape, given in SHAPES.items()}
+SHAPES = {shape: (drawing(shape), {**sound, "color": RED}) for shape, sound in SHAPES.items()}
 PICTURES = {
     "canvas": (Canvas, CANVAS),
-    "world": (lambda **given: Canvas((40, 40), World(**given)).circle(HERE, 0.5, RED), BOUNDS),
+    "world": (lambda **odd: Canvas((40, 40), World(**odd)).circle(HERE, 0.5, RED), BOUNDS),
     "scene of a cart-pole": (
-        lambda **given: render(CartPoleScene(**given), CartPoleFrame(0.1, 0.1)),
+        lambda **odd: render(CartPoleScene(**odd), CartPoleFrame(0.1, 0.1)),
         {"x_threshold": 2.4, "pole_length": 1.0, "angle_threshold": 0.2, "force_scale": 1.0},
     ),
-    "scene of a pendulum": (lambda **given: render(PendulumScene(**given)), {"torque_limit": 1.0}),
-    "frame": (lambda **given: render(frame=PendulumFrame(**given)), {"angle": 1.0, "torque": 0.5}),
+    "scene of a pendulum": (lambda **odd: render(PendulumScene(**odd)), {"torque_limit": 1.0}),
+    "frame": (lambda **odd: render(frame=PendulumFrame(**odd)), {"angle": 1.0, "torque": 0.5}),
     "overlay": (
-        lambda **given: render(overlay=Overlay(**given)),
+        lambda **odd: render(overlay=Overlay(**odd)),
         {"time": 0.0, "action": "+1 N", "reward": 1.0, "episode_return": 2.0},
     ),
     "picture": (render, {"frame": FRAME, "overlay": OVERLAY}),
-    "renderer": (
-        render,
-        {
-            "scene": PENDULUM,
-            "size": (40, 40),
-            "fps": 50.0,
-            "render_mode": "rgb_array",
-            "title": "x",
-        },
-    ),
+    "renderer": (render, RENDERER | {"title": "x"}),
 }
 
 

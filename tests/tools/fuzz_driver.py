@@ -1,4 +1,4 @@
-"""What all fuzzing programs share: their command line, the running of cases, and the report.
+"""The command line of the fuzzing programs, the running of their cases, and the report.
 
     python tests/tools/fuzz_PROGRAM.py --count 4000 --seed 0 [--first N]
 
@@ -6,7 +6,6 @@ A case ends in one of these ways:
 
 * It is accepted, and what follows works.
 * It is refused with an error of the package's own family, ``FMUGymError``.
-* It ends in an exception of the caller's own code, such as a hook; few programs have that.
 * It ends outside: with any other exception. This must never happen.
 * It fails otherwise, which must not happen either: with an error that a terminal could obey or that
   is very long, a wrong result, a file that is left, more than ``SLOW`` seconds of processor time,
@@ -40,7 +39,7 @@ LARGE = 300 * 2**20
 LONG = 2000
 """More characters than the text of an error may have."""
 
-OUTCOMES = ("accepted", "refused", "the caller's own", "outside", "failed")
+OUTCOMES = ("accepted", "refused", "outside", "failed")
 
 
 class CaseError(Exception):
@@ -60,15 +59,11 @@ class Case(NamedTuple):
         play: Does it; an error of the family means that it is refused.
         kind: What the report counts it under.
         values: What is odd in it, for the report of a failure.
-        keeps: Whether it may leave something in the temporary folder until the program ends.
-        is_own: Whether an exception is the caller's own, and so may come out.
     """
 
     play: Callable[[], Any]
     kind: str = "all"
     values: Any = ""
-    keeps: bool = False
-    is_own: Callable[[BaseException], bool] = lambda error: False
 
 
 class Tally(NamedTuple):
@@ -124,16 +119,6 @@ def run(program, count, seed, first=0, report=lambda line: None):
     return tally
 
 
-def of_kinds(kinds):
-    """A program of functions that make what is played of a random generator and a folder."""
-
-    def make(rng, folder):
-        kind = rng.choice(kinds)
-        return Case(kind(rng, folder), kind.__name__)
-
-    return lambda: contextlib.nullcontext(make)
-
-
 def _run_one(make, seed, folder):
     """Run one case; returns its kind, how it ended, and what is wrong with it."""
     before = set(os.listdir(folder))
@@ -144,7 +129,7 @@ def _run_one(make, seed, folder):
             case = make(random.Random(seed), Path(own))
             outcome, trouble = _watch(case)
     left = sorted(set(os.listdir(folder)) - before)
-    if left and not case.keeps and not trouble:
+    if left and not trouble:
         outcome, trouble = "failed", f"left {left}"
     if trouble:
         trouble = f"{case.kind} {describe(case.values)}: {trouble}"
@@ -175,8 +160,6 @@ def _play(case):
     except CaseError as error:
         return "failed", str(error)
     except Exception as error:
-        if case.is_own(error):
-            return "the caller's own", ""
         return "outside", f"{type(error).__name__}: {describe(error)} {place(error)}"
     return "accepted", ""
 
