@@ -346,6 +346,13 @@ MANY = {
 }
 
 
+def test_an_action_of_texts_is_refused(made):
+    env = made(fmugym.envs.PendulumEnv)
+    env.reset()
+    with pytest.raises(fmugym.ConfigError, match="numbers"):
+        env.step(np.array(["a"]))
+
+
 @given(st.sampled_from(CLASSES), st.sampled_from(sorted(SINGLE)), VALUES)
 def test_an_environment_lives_on_after_an_odd_call(made, cls, name, odd):
     require_alive_after(made(cls), SINGLE[name], odd)

@@ -186,8 +186,8 @@ HOSTILE = st.sampled_from(
         st.builds(hostile, st.lists(st.sampled_from(METHODS), max_size=2, unique=True)),
         st.builds(hostile, st.sampled_from((["__repr__"], ["__float__"])), st.just(float)),
         st.builds(hostile, st.sampled_from((["__repr__"], ["__index__"])), st.just(int)),
-        st.builds(hostile, st.sampled_from((["__iter__"], ["__len__"])), st.just(list)),
-        st.builds(hostile, st.sampled_from((["__iter__"], ["keys"], ["items"])), st.just(dict)),
+        st.builds(hostile, st.just(["__iter__", "__len__"]), st.just(list)),
+        st.builds(hostile, st.sampled_from((["keys"], ["__iter__", "items"])), st.just(dict)),
         st.builds(hostile, st.just(["__hash__"]), st.just(str)),
     )
 ).flatmap(lambda kind: kind)
