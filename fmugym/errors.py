@@ -174,7 +174,7 @@ def first_of(names: Sequence[str]) -> str:
     return printable(f"{few} and {more} more" if more > 0 else few)
 
 
-def reason(error: Exception) -> str:
+def reason(error: object) -> str:
     """Return the text of an error of another library, which may quote any amount of a file."""
     text = str(error)
     return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."

@@ -269,7 +269,7 @@ def _of_shape(action: Any, space: spaces.Space[Any]) -> Any:
         ConfigError: If it has another number of elements, or does not consist of numbers.
     """
     shape = space.shape or ()
-    if type(action) is np.ndarray and action.shape == shape:
+    if type(action) is np.ndarray and action.shape == shape and action.dtype.kind in "biuf":
         return action
     try:
         array = np.asarray(action)

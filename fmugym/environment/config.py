@@ -108,7 +108,10 @@ def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
 
 def _drawn_array(what: str, value: Any) -> npt.NDArray[Any]:
     """Return an array of objects for an array with distributions in it."""
-    shape, elements = flattened(value)
+    try:
+        shape, elements = flattened(value)
+    except Exception:  # a list of the caller's that fails
+        shape, elements = None, []
     elements = [as_distribution(what, one) for one in elements]
     if shape is None or not any(map(is_distribution, elements)):
         raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}")

@@ -121,7 +121,7 @@ class SafeZip:
             entries = _read_directory(path, limits)
         except _ZIP_ERRORS as error:
             raise FMULoadError(
-                f"{path.name} is not an FMU (a zip archive): {reason(error)}"
+                f"{reason(path.name)} is not an FMU (a zip archive): {reason(error)}"
             ) from None
         self._check_sizes(entries)
         self._links: dict[str, zipfile.ZipInfo] = {}

@@ -21,7 +21,7 @@ from fmugym.environment.saved_episode import columns_of, note_attributes, place_
 from fmugym.environment.snapshots import Columns, Snapshot, stacked
 from fmugym.environment.vector.arguments import UnknownAttributeError
 from fmugym.environment.vector.quantity_arrays import take
-from fmugym.errors import SimulationError
+from fmugym.errors import SimulationError, reason
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.fmi.variable import Variable
 from fmugym.pool import Pool
@@ -152,7 +152,7 @@ def attribute(env: FMUEnv, name: str) -> Any:
     try:
         return getattr(env, name)
     except AttributeError as error:
-        raise UnknownAttributeError(str(error)) from None
+        raise UnknownAttributeError(reason(error)) from None
 
 
 class Episodes(ABC):
