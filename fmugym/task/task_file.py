@@ -412,7 +412,8 @@ def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 def _plain(value: Any) -> Any:
     """The value in types that a file can hold, as far as that is possible."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items() if item is not None}
+        items = ((str(key), _plain(item)) for key, item in value.items())
+        return {key: item for key, item in items if item is not None}
     if isinstance(value, OWN_DISTRIBUTIONS):
         return _plain(asdict(value))
     if isinstance(value, list | tuple):
