@@ -313,6 +313,7 @@ EXHAUSTIVE_TESTS = (
     "test_series.py::TestPictures::test_long",
     "test_series.py::TestReport::test_it_has_the_interval",
     "test_series.py::TestReport::test_it_is_one",
+    "test_several_instances.py::TestLength",
     "test_shared_data.py::test_steps_in_threads",
     "test_slow_models.py::TestTime",
     "test_systems_many.py",
