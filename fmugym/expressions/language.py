@@ -105,7 +105,7 @@ class Expression:
             ConfigError: If it is no expression. The text tells the column.
         """
         if isinstance(value, bool | int | float):
-            value = repr(value if isinstance(value, bool) else _finite(value))
+            value = repr(value) if isinstance(value, bool) else _text_of(value)
         if not isinstance(value, str):
             raise ConfigError(f"expected an expression, got {shown(value)}")
         if len(value) > _LONGEST:
@@ -186,10 +186,11 @@ class Expression:
         return float(value)
 
 
-def _finite(value: float) -> float:
+def _text_of(value: float) -> str:
+    """A finite number as Python's own types write it, whatever a derived type makes of it."""
     if not math.isfinite(float_or_nan(value)):
         raise ConfigError(f"expected an expression or a finite number, got {shown(value)}")
-    return value
+    return int.__repr__(value) if isinstance(value, int) else float.__repr__(value)
 
 
 def _parsed(text: str) -> ast.expr:

@@ -431,7 +431,14 @@ def _plain(value: Any) -> Any:
         return value.to_pydatetime(warn=False)
     if isinstance(value, type):
         return _named(value)
-    return os.fspath(value) if isinstance(value, os.PathLike) else value
+    return _text_of_path(value) if isinstance(value, os.PathLike) else value
+
+
+def _text_of_path(path: os.PathLike[Any]) -> Any:
+    """The text of a path; the path itself, which is refused later, if it has none."""
+    with suppress(Exception):  # of the caller's class
+        return os.fspath(path)
+    return path
 
 
 def _named(value: type) -> Any:

@@ -10,10 +10,19 @@ import pytest
 import tomlkit
 from hypothesis import given
 from hypothesis import strategies as st
-from odd_values import GROUPS, NUMBERS, OBJECTS, TEXTS, working_or_refused
+from odd_values import (
+    GROUPS,
+    NUMBERS,
+    OBJECTS,
+    TEXTS,
+    Slippery,
+    Unspeakable,
+    working_or_refused,
+)
 
 import fmugym
 from fmugym.errors import FMULoadError, TaskError
+from fmugym.expressions.language import Expression
 from fmugym.task.task_entries import Entry
 from fmugym.task.task_keys import TASK
 
@@ -236,10 +245,14 @@ def test_a_sound_task_is_played(task, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("key", ["fmu", "time_step", "variables", "agent", "reward", "zzz"])
-@pytest.mark.parametrize("odd", [10**5000, "\x1b[31m", [[]], object()], ids=type)
+@pytest.mark.parametrize("odd", [10**5000, "\x1b[31m", [[]], object(), Unspeakable()], ids=type)
 def test_an_odd_value_is_refused_by_its_key(task, key, odd):
     with pytest.raises(TaskError, match=key):
         load(task | {key: odd})
+
+
+def test_a_number_without_a_text_is_an_expression():
+    assert Expression.parse(Slippery(1.5)).text == "1.5"
 
 
 def test_an_error_without_a_place_is_found(task, monkeypatch):
