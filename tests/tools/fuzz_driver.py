@@ -18,26 +18,22 @@ a seed is always the same; ``--first n --count 1`` repeats it.
 import argparse
 import contextlib
 import faulthandler
-import logging
 import os
 import random
 import sys
 import tempfile
 import time
-import warnings
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
+from odd_values import LONG, quiet
 
 from fmugym import FMUGymError
 
 SLOW, HANG = 5.0, 60.0
 LARGE = 300 * 2**20
-LONG = 2000
-"""More characters than the text of an error may have."""
 
 OUTCOMES = ("accepted", "refused", "outside", "failed")
 
@@ -211,18 +207,6 @@ def temporary_folder():
             yield Path(folder)
         finally:
             tempfile.tempdir = before
-
-
-@contextlib.contextmanager
-def quiet():
-    """Without warnings, which odd values bring about by the thousand, and log messages."""
-    logging.disable(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 def say(text):

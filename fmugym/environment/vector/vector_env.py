@@ -200,7 +200,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             refuse_positional(misplaced)
         if not self.episodes.is_ready or self._background.is_pending:
             require_open(self, "reset")
-        elif seed is None and type(options) is dict and [*options] == ["reset_mask"]:
+        elif (
+            seed is None and type(options) is dict and len(options) == 1 and "reset_mask" in options
+        ):
             try:
                 result = self.task.start_at_once(options["reset_mask"])
             except BaseException:
