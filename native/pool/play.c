@@ -165,17 +165,11 @@ static void start_rows(const Turn *turn, const RowStarts *starts, const uint32_t
     }
 }
 
-static void start_listed(const Turn *turn, const uint32_t *starting, size_t count) {
+void play_start_episodes(const Turn *turn, const uint32_t *starting, size_t count) {
     for (size_t j = 0; j < count; j++) {
         forget_actions(&turn->play->actions, starting[j]);
     }
     start_rows(turn, &turn->play->starts, starting, count);
-}
-
-void play_start_episode(const Turn *turn, size_t index) {
-    const uint32_t starting = (uint32_t)index;
-
-    start_listed(turn, &starting, 1);
 }
 
 WIDE static bool is_any(const uint8_t *flags, size_t count) {
@@ -202,11 +196,11 @@ static size_t list_starting(const Play *play, size_t begin, size_t count, uint32
     return number;
 }
 
-void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
+void play_start_after_ended(const Turn *turn, size_t begin, size_t count) {
     uint32_t starting[PROGRAM_WIDTH];
     const size_t number = list_starting(turn->play, begin, count, starting);
 
-    start_listed(turn, starting, number);
+    play_start_episodes(turn, starting, number);
 }
 
 WIDE static size_t number_of(const uint8_t *flags, size_t count) {

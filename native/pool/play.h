@@ -114,7 +114,7 @@ void play_open(const Turn *turn, PlayScratch *scratch);
 /* All three handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
  * are reset or stepped, the second afterwards where they were reset, the third at last. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
-void play_start_episodes(const Turn *turn, size_t begin, size_t count);
+void play_start_after_ended(const Turn *turn, size_t begin, size_t count);
 void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
                 PlayScratch *scratch, Verdict *verdict);
 
@@ -126,8 +126,9 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 /* Keeps so many outputs of a run, from the first of them on, before the new ones replace them. */
 void play_keep_outputs(const Play *play, size_t first, size_t number, size_t begin, size_t count);
 
-/* Sets what programs and hooks read at the start of an episode: actions, and the rows of starts. */
-void play_start_episode(const Turn *turn, size_t index);
+/* Sets what programs and hooks read at the start of the listed environments' episodes: actions, and the
+ * rows of starts. */
+void play_start_episodes(const Turn *turn, const uint32_t *starting, size_t count);
 
 /* Writes zeros as the results of an environment that is neither reset nor stepped, because memory ran
  * out. */

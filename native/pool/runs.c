@@ -28,17 +28,26 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
     return instance_read_outputs(task->pool, me, scratch);
 }
 
+static size_t run_starts(Task *task, size_t begin, size_t end, Scratch scratch) {
+    size_t troubled = 0;
+
+    for (size_t first = begin; first < end; first += RUN) {
+        const uint32_t *starting = task->pool->chosen + first;
+        troubled += start_episodes(task, starting, length_of_run(first, end), scratch);
+    }
+    return troubled;
+}
+
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
     Pool *pool = task->pool;
     const Call *call = task->call;
     size_t troubled = 0;
 
+    if (call->turn != NULL) {
+        return run_starts(task, begin, end, scratch);
+    }
     for (size_t i = begin; i < end; i++) {
         const size_t index = pool->chosen[i];
-        if (call->turn != NULL) {
-            troubled += starts_one(task, index, scratch);
-            continue;
-        }
         Instance *me = &pool->instances[index];
         const Status status = task->operation == RESTORE ? restore_instance(task, me, i, scratch)
                                                          : instance_reset(pool, me, call, scratch);
@@ -470,7 +479,7 @@ static size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
         troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
         replace_outputs(task, run.begin, run.count, scratch.outputs);
         if (task->operation == PLAY) {
-            play_start_episodes(turn, run.begin, run.count);
+            play_start_after_ended(turn, run.begin, run.count);
         }
     }
     play_conclude(turn, run.begin, run.count, &fresh, run.registers, run.verdict);

@@ -4,8 +4,8 @@
 #ifndef FMUGYM_RUNS_H
 #define FMUGYM_RUNS_H
 
-#include "pool/starts.h"
 #include "pool/task.h"
+#include "program/program.h"
 
 enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
 

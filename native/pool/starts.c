@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "pool/initial_states.h"
+#include "pool/runs.h"
 
 static float *observation_of(const Task *task, size_t index) {
     return task->call->observations + index * task->pool->settings.num_observed;
@@ -22,22 +23,37 @@ static bool has_finite_observation(const Task *task, size_t index) {
     return finite;
 }
 
-size_t starts_one(Task *task, size_t index, Scratch scratch) {
+/* Returns whether the environment is in trouble. */
+static bool reset_drawn(Task *task, size_t index, Scratch scratch) {
     Pool *pool = task->pool;
-    const Call *call = task->call;
-    const Play *play = call->turn->play;
 
-    play_draw(call->turn, index);
-    const Status status = instance_reset(pool, &pool->instances[index], call, scratch);
-    const size_t troubled = note_status(task, index, status);
+    play_draw(task->call->turn, index);
+    return note_status(task, index,
+                       instance_reset(pool, &pool->instances[index], task->call, scratch)) > 0;
+}
 
-    play_start_episode(call->turn, index);
-    play->ended[index] = 0;
-    if (call->observations == NULL) {
-        return troubled;
+/* Returns whether the observation of an episode that starts is finite. */
+static bool write_first_observation(const Task *task, size_t index) {
+    if (task->call->observations == NULL) {
+        return true;
     }
-    write_observation(pool, index, call->observations);
-    return troubled > 0 || !has_finite_observation(task, index);
+    write_observation(task->pool, index, task->call->observations);
+    return has_finite_observation(task, index);
+}
+
+size_t start_episodes(Task *task, const uint32_t *starting, size_t count, Scratch scratch) {
+    bool troubled[RUN];
+    size_t number = 0;
+
+    for (size_t j = 0; j < count; j++) {
+        troubled[j] = reset_drawn(task, starting[j], scratch);
+    }
+    play_start_episodes(task->call->turn, starting, count);
+    for (size_t j = 0; j < count; j++) {
+        task->call->turn->play->ended[starting[j]] = 0;
+        number += !write_first_observation(task, starting[j]) || troubled[j];
+    }
+    return number;
 }
 
 /* After a fault, the environment stays as it is, so that the caller can say what the fault was. */
@@ -58,18 +74,32 @@ static void keep_last(const Task *task, size_t index) {
     }
 }
 
-size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started) {
-    const Turn *turn = task->call->turn;
-    size_t troubled = 0;
+/* Lists the environments of a run whose next episodes start, and notes that they do. */
+static size_t list_starting(const Task *task, const PlayedRun *run, uint32_t *starting) {
+    size_t count = 0;
 
-    for (size_t index = run.begin; index < run.begin + run.count; index++) {
-        turn->started[index] = has_ended_well(task, &run, index);
-        if (turn->started[index]) {
-            keep_last(task, index);
-            troubled += starts_one(task, index, scratch);
-            ++*started;
-            play_observe(turn, index, 1, run.registers, run.verdict);
+    for (size_t index = run->begin; index < run->begin + run->count; index++) {
+        const bool starts = has_ended_well(task, run, index);
+        task->call->turn->started[index] = starts;
+        if (starts) {
+            starting[count++] = (uint32_t)index;
         }
     }
+    return count;
+}
+
+size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started) {
+    const Turn *turn = task->call->turn;
+    uint32_t starting[RUN];
+    const size_t count = list_starting(task, &run, starting);
+
+    for (size_t j = 0; j < count; j++) {
+        keep_last(task, starting[j]);
+    }
+    const size_t troubled = start_episodes(task, starting, count, scratch);
+    for (size_t j = 0; j < count; j++) {
+        play_observe(turn, starting[j], 1, run.registers, run.verdict);
+    }
+    *started += count;
     return troubled;
 }

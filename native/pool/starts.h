@@ -18,7 +18,7 @@ typedef struct {
  * trouble. */
 size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started);
 
-/* Starts an episode of one environment. Returns 1 if it is in trouble, otherwise 0. */
-size_t starts_one(Task *task, size_t index, Scratch scratch);
+/* Starts episodes of the listed environments, at most RUN of them. Returns how many are in trouble. */
+size_t start_episodes(Task *task, const uint32_t *starting, size_t count, Scratch scratch);
 
 #endif
