@@ -132,8 +132,7 @@ class Draws:
 class Pool:
     """N instances of one FMU.
 
-    A call that is given the very array ``inputs`` or ``observations`` of the pool uses it without
-    a look at its buffer. Any method may be called from any thread at any time; calls take turns.
+    Any method may be called from any thread at any time; calls take turns.
     Afterwards the messages of the FMU go to ``callback``. What that raises comes out of the method,
     whose work is done by then. The next call reports the other messages.
 
@@ -161,20 +160,15 @@ class Pool:
         calls_python: bool = False,
         /,
     ) -> Pool: ...
-    def step_own(self) -> int:
-        """Step all with the pool's own inputs; writes the pool's own observations.
+    def step(self, skip: Array | None, /) -> int:
+        """Step all but those in the mask with the pool's inputs, and write all observations.
 
         Returns:
-            How many of the instances have a status worse than a warning now; so do the others.
+            How many have a status worse than a warning.
         """
 
-    def step(self, inputs: Array | None, skip: Array | None, observations: Array | None, /) -> int:
-        """Step all but those in ``skip``; ``None`` for ``inputs`` means the pool's own."""
-
-    def reset(
-        self, start: Access, values: Array, mask: Array | None, observations: Array | None, /
-    ) -> int:
-        """Start those in the mask anew, and write their observations."""
+    def reset(self, start: Access, values: Array, mask: Array | None, /) -> int:
+        """Start those in the mask anew; the rest is as for ``step``, without observations."""
 
     def prepare_play(
         self,

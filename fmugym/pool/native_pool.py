@@ -17,6 +17,7 @@ import logging
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
@@ -67,8 +68,6 @@ _MOST_CACHED: Final = 64
 _BETWEEN_LOOKS: Final = 1e-3
 """Seconds between two looks for the FMU's files in steps; a look takes some microseconds."""
 
-FloatArray32 = npt.NDArray[np.float32]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -87,10 +86,10 @@ class NativePool(EnginePool):
             of its global variables.
 
     Attributes:
-        inputs: The inputs of ``step_own``, shape (k_in, N), float64.
+        inputs: The inputs, shape (k_in, N), float64.
         outputs: The outputs, shape (k, N), float64.
         statuses: The statuses, shape (N,), int8.
-        observations: The observations of ``step_own``, shape (N, num_observed), float32.
+        observations: The observations after a step, shape (N, num_observed), float32.
         threads: The most threads that a call uses.
 
     Raises:
@@ -122,7 +121,7 @@ class NativePool(EnginePool):
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self._prepare(fmu, spec, log)
         self._answers = Answers(fmu.description, spec, slice(0, num_instances))
-        self.step_own = self._pool.step_own
+        self.step_own = partial(self._pool.step, None)
         self._reset = self._pool.reset
         self._starting_play = (
             self._with_files(self._pool.play),
@@ -174,16 +173,15 @@ class NativePool(EnginePool):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: FloatArray32 | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
         if inputs is not None:
             np.copyto(self.inputs, inputs)
         try:
-            self._pool.step(None, skip, observations)
+            self._pool.step(skip)
         except (TypeError, BufferError, ValueError) as error:
             require_refusal(error)
-            self._open_pool().step(None, _as_mask(skip), observations)
+            self._open_pool().step(_as_mask(skip))
         return self._result
 
     def failure(self, index: int) -> str:
@@ -256,11 +254,11 @@ class NativePool(EnginePool):
         """See ``RetryingPool._reset_once``."""
         access = self._accesses.get(variables) or self._access(variables)
         try:
-            return self._reset(access, values, mask, None)
+            return self._reset(access, values, mask)
         except (TypeError, BufferError, ValueError) as error:
             require_refusal(error)
             self._open_pool()
-            return self._reset(access, np.asarray(values, np.float64), _as_mask(mask), None)
+            return self._reset(access, np.asarray(values, np.float64), _as_mask(mask))
 
     def extract(self) -> bool:
         """See ``Pool.extract``."""

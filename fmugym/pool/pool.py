@@ -89,9 +89,9 @@ class Pool(ABC):
         inputs: Shape (k_in, N); the caller writes to it before a step.
         outputs: Shape (k, N).
         statuses: Shape (N,).
-        observations: The array that ``step_own`` fills, shape (N, num_observed).
-        step_own: Does one step with the values in ``inputs``, and fills ``observations``.
-            Returns how many instances have a status worse than a warning.
+        observations: The first ``num_observed`` outputs after a step, shape (N, num_observed).
+        step_own: Steps all instances with the values in ``inputs``. Returns how many have a status
+            worse than a warning.
         execution: Sentences on how the pool runs, and why; see ``fmugym.pool.opening``.
     """
 
@@ -126,15 +126,12 @@ class Pool(ABC):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """Do one step with the instances.
 
         Args:
             inputs: Shape (k_in, N), finite, copied to ``self.inputs``; None to use those values.
             skip: The instances not to step, shape (N,). Their outputs and statuses stay unchanged.
-            observations: Array to fill with the first ``num_observed`` outputs of all instances,
-                shape (N, num_observed), C-contiguous.
 
         Returns:
             The outputs, shape (k, N), and the statuses, shape (N,).

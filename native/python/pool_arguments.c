@@ -11,9 +11,8 @@ static bool take_form(PyPool *self, const char *form, Py_ssize_t size) {
     return fault == NULL;
 }
 
-static bool take_arrays(PyPool *self) {
+static bool take_arrays(PyPool *self, PyObject *const *arrays) {
     const Settings *s = &self->opening.settings;
-    PyObject *const *arrays = self->arrays;
     Py_buffer *b = self->buffers;
     const Py_ssize_t n = (Py_ssize_t)s->count;
 
@@ -29,7 +28,7 @@ static bool take_arrays(PyPool *self) {
 }
 
 bool take_pool_arguments(PyPool *self, PyObject *args) {
-    PyObject **arrays = self->arrays;
+    PyObject *arrays[BUFFERS];
     Settings *s = &self->opening.settings;
     const char *form;
     Py_ssize_t size;
@@ -38,7 +37,7 @@ bool take_pool_arguments(PyPool *self, PyObject *args) {
     if (!PyArg_ParseTuple(args, "y#(OOOOO)O|p:Pool", &form, &size, &arrays[INPUTS], &arrays[OUTPUTS],
                           &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
                           &self->callback, &self->calls_python) ||
-        !take_form(self, form, size) || !take_arrays(self)) {
+        !take_form(self, form, size) || !take_arrays(self, arrays)) {
         return false;
     }
     s->output_values = self->buffers[OUTPUTS].buf;

@@ -5,43 +5,16 @@
 #include "pool/requests.h"
 #include "python/python.h"
 
-/* A call and its result. */
+/* A call, its result, and the arrays of the caller. All others are the pool's own. */
 typedef struct {
     int operation;
     Call call;
     size_t troubled;
-} Doing;
-
-/* The same with the arrays that it keeps. The pool's own arrays need no new buffer. */
-typedef struct {
-    Doing doing;
-    Py_buffer inputs, mask, observations, values;
+    Py_buffer mask, values;
 } PyCall;
-
-static void release_views(PyCall *c) {
-    release_buffer(&c->inputs);
-    release_buffer(&c->mask);
-    release_buffer(&c->observations);
-    release_buffer(&c->values);
-}
 
 static Matrix matrix_of(const Py_buffer *buffer) {
     return (Matrix){buffer->buf, buffer->strides[0], buffer->strides[1]};
-}
-
-static bool view_inputs(PyPool *self, PyObject *object, PyCall *c) {
-    const Settings *s = &self->pool.settings;
-    Py_buffer *buffer = &self->buffers[INPUTS];
-
-    if (object != self->arrays[INPUTS] && object != Py_None) {
-        buffer = &c->inputs;
-        if (!take_matrix(object, buffer, COPIED, "inputs", ITEM_FLOAT64,
-                         (Py_ssize_t)s->inputs->count, (Py_ssize_t)s->count)) {
-            return false;
-        }
-    }
-    c->doing.call.inputs = matrix_of(buffer);
-    return true;
 }
 
 static bool view_mask(PyPool *self, PyObject *object, PyCall *c) {
@@ -52,25 +25,7 @@ static bool view_mask(PyPool *self, PyObject *object, PyCall *c) {
                      (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    c->doing.call.mask = (Mask){c->mask.buf, c->mask.strides[0]};
-    return true;
-}
-
-static bool view_observations(PyPool *self, PyObject *object, PyCall *c) {
-    const Settings *s = &self->pool.settings;
-    Py_buffer *buffer = &self->buffers[OBSERVATIONS];
-
-    if (object == Py_None) {
-        return true;
-    }
-    if (object != self->arrays[OBSERVATIONS]) {
-        buffer = &c->observations;
-        if (!take_matrix(object, buffer, WRITTEN, "observations", ITEM_FLOAT32,
-                         (Py_ssize_t)s->count, (Py_ssize_t)s->num_observed)) {
-            return false;
-        }
-    }
-    c->doing.call.observations = buffer->buf;
+    c->call.mask = (Mask){c->mask.buf, c->mask.strides[0]};
     return true;
 }
 
@@ -78,70 +33,46 @@ static bool view_start(PyPool *self, PyObject *access, PyObject *values, PyCall 
     if (!is_access(self, access)) {
         return false;
     }
-    c->doing.call.start = &((PyAccess *)access)->access;
+    c->call.start = &((PyAccess *)access)->access;
     if (!take_matrix(values, &c->values, COPIED, "values", ITEM_FLOAT64,
-                     (Py_ssize_t)c->doing.call.start->count, (Py_ssize_t)self->pool.settings.count)) {
+                     (Py_ssize_t)c->call.start->count, (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    c->doing.call.start_values = matrix_of(&c->values);
+    c->call.start_values = matrix_of(&c->values);
     return true;
 }
 
 static void do_call(PyPool *self, bool alone, void *context) {
-    Doing *d = context;
+    PyCall *c = context;
 
-    d->call.alone = alone;
-    d->troubled = d->operation == STEP ? pool_step(&self->pool, &d->call)
-                                       : pool_reset(&self->pool, &d->call);
+    c->call.alone = alone;
+    c->call.inputs = matrix_of(&self->buffers[INPUTS]);
+    c->troubled = c->operation == STEP ? pool_step(&self->pool, &c->call)
+                                       : pool_reset(&self->pool, &c->call);
 }
 
-static PyObject *result_of(PyPool *self, const Doing *d, bool done) {
-    return done && report_messages(self) ? PyLong_FromSize_t(d->troubled) : NULL;
+static PyObject *finish(PyPool *self, PyCall *c, bool good) {
+    const bool done = good && perform(self, c->operation, do_call, c);
+
+    release_buffer(&c->mask);
+    release_buffer(&c->values);
+    return done && report_messages(self) ? PyLong_FromSize_t(c->troubled) : NULL;
 }
 
-static PyObject *finish(PyPool *self, PyCall *c) {
-    const bool done = perform(self, c->doing.operation, do_call, &c->doing);
-
-    release_views(c);
-    return result_of(self, &c->doing, done);
-}
-
-static PyObject *give_up(PyCall *c) {
-    release_views(c);
-    return NULL;
-}
-
-PyObject *py_step_own(PyObject *object, PyObject *unused) {
+PyObject *py_step(PyObject *object, PyObject *mask) {
     PyPool *self = (PyPool *)object;
-    Doing d = {.operation = STEP,
-               .call = {.inputs = matrix_of(&self->buffers[INPUTS]),
-                        .observations = self->buffers[OBSERVATIONS].buf}};
+    PyCall c = {.operation = STEP, .call = {.observations = self->buffers[OBSERVATIONS].buf}};
 
-    (void)unused;
-    return result_of(self, &d, perform(self, d.operation, do_call, &d));
-}
-
-PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-    PyCall c = {.doing = {.operation = STEP}};
-
-    if (has_arguments(nargs, 3) && view_inputs(self, args[0], &c) && view_mask(self, args[1], &c) &&
-        view_observations(self, args[2], &c)) {
-        return finish(self, &c);
-    }
-    return give_up(&c);
+    return finish(self, &c, view_mask(self, mask, &c));
 }
 
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
-    PyCall c = {.doing = {.operation = RESET}};
+    PyCall c = {.operation = RESET};
 
-    if (has_arguments(nargs, 4) && view_inputs(self, Py_None, &c) &&
-        view_start(self, args[0], args[1], &c) && view_mask(self, args[2], &c) &&
-        view_observations(self, args[3], &c)) {
-        return finish(self, &c);
-    }
-    return give_up(&c);
+    return finish(self, &c,
+                  has_arguments(nargs, 3) && view_start(self, args[0], args[1], &c) &&
+                      view_mask(self, args[2], &c));
 }
 
 static void do_count_steps(PyPool *self, bool alone, void *context) {

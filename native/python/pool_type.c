@@ -115,8 +115,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
 
 static PyMethodDef methods[] = {
 #define FAST(name, function) {name, (PyCFunction)(void (*)(void))function, METH_FASTCALL, NULL}
-    {"step_own", py_step_own, METH_NOARGS, NULL},
-    FAST("step", py_step),
+    {"step", py_step, METH_O, NULL},
     FAST("reset", py_reset),
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},

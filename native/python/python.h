@@ -32,7 +32,6 @@ typedef struct {
     Opening opening;
     PyObject *arguments; /* keeps the arrays and the callback alive */
     PyObject *callback;
-    PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
 } PyPool;
@@ -70,8 +69,7 @@ bool report_messages(PyPool *self);
 
 /* The methods of a pool */
 
-PyObject *py_step_own(PyObject *object, PyObject *unused);
-PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_step(PyObject *object, PyObject *mask);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_ask(PyObject *object, PyObject *args);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);

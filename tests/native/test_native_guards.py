@@ -62,13 +62,13 @@ def counting_in(counts):
 
 
 class TestArrays:
-    def test_inputs_at_any_address(self, cart_poles):
-        cart_poles._pool.step(misaligned((1, 6), np.float64), None, None)
-        assert not cart_poles.statuses.any()
-
-    def test_observations_that_are_not_aligned(self, cart_poles):
-        with pytest.raises(ValueError, match="observations must begin at a multiple of 4 bytes"):
-            cart_poles.step(None, None, misaligned((6, 2), np.float32))
+    def test_start_values_at_any_address(self, cart_poles):
+        theta = (cart_poles.variable("theta_0"),)
+        values = misaligned((1, 6), np.float64)
+        values[:] = 1.5
+        outputs, statuses = cart_poles.reset(theta, values)
+        assert outputs[1].tolist() == [1.5] * 6
+        assert not statuses.any()
 
     def test_health_that_is_not_aligned(self):
         counts = misaligned(no_counts(1).shape, np.int64)
@@ -325,7 +325,7 @@ class TestPrograms:
         ids=str,
     )
     def test_surroundings_that_do_not_fit(self, cart_poles, changes):
-        with pytest.raises((TypeError, ValueError), match=r"must|differ|fit|float64"):
+        with pytest.raises((TypeError, ValueError), match=r"must|differ|fit|float64|damaged"):
             prepare(cart_poles, program(FAILED), **changes)
 
     @pytest.mark.parametrize(

@@ -266,9 +266,11 @@ class TestDynamics:
     def test_observations(self, plant):
         pool = plant.pool(3, num_observed=2)
         plant.rollout(pool, plant.start_values(8, 3), [])
-        observations = np.full((3, 2), np.nan, np.float32)
-        outputs, _ = pool.step(plant.inputs(8, 1, 3)[0], observations=observations)
-        np.testing.assert_array_equal(observations, outputs[:2].T.astype(np.float32))
+        skip = np.array([False, True, False])
+        for skipped in (None, skip):
+            outputs, _ = pool.step(plant.inputs(8, 1, 3)[0], skipped)
+            expected = outputs[:2].T.astype(np.float32)
+            np.testing.assert_array_equal(pool.observations, expected)
 
     @plants_in_engines
     def test_read(self, plant):

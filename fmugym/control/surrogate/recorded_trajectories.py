@@ -123,10 +123,9 @@ class RecordingPool(Pool):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
-        self._pool.step(inputs, skip, observations)
+        self._pool.step(inputs, skip)
         for index in _places(None if skip is None else ~skip, self.num_instances):
             self._courses.steps += 1
             if self.statuses[index] > WARNING_CODE:
@@ -137,7 +136,7 @@ class RecordingPool(Pool):
         return self.outputs, self.statuses
 
     def _step_own(self) -> int:
-        self.step(None, None, self.observations)
+        self.step()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:

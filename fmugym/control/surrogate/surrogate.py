@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fmugym.control.surrogate.terms import Start, Terms, rows_in
 from fmugym.errors import SimulationError
@@ -96,7 +95,6 @@ class SurrogatePool(CountedPool):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
         if inputs is not None:
@@ -106,8 +104,8 @@ class SurrogatePool(CountedPool):
         self._run()
         self._keep(wanted)
         self._counts[wanted, Column.STEPS] += 1
-        if observations is not None:
-            np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
+        observed = self.outputs[: self._spec.num_observed].T
+        np.copyto(self.observations, observed, casting="same_kind")
         return self.outputs, self.statuses
 
     def _take_inputs(self, wanted: MaskArray) -> None:
@@ -133,7 +131,7 @@ class SurrogatePool(CountedPool):
         np.copyto(self.outputs, self._next, where=wanted)
 
     def _step_own(self) -> int:
-        self.step(None, None, self.observations)
+        self.step()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     def prepare_play(self, variables: tuple[Variable, ...], *parts: Any) -> Play:

@@ -67,7 +67,6 @@ class PoolColumn(Pool):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
         if inputs is not None:
@@ -78,7 +77,6 @@ class PoolColumn(Pool):
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
         self.step()
-        self.observations[0] = self.outputs[: self.observations.shape[1], 0]
         return int(self.statuses[0] > WARNING_CODE)
 
     @property

@@ -249,7 +249,6 @@ class EachHooks(VectorTask):
 
     def __init__(self, envs: Sequence[FMUEnv], pool: Pool, max_episode_steps: int | None) -> None:
         super().__init__(SeparateEpisodes(envs, pool))
-        self._observed = pool.observations
         self._checks_all = is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = batch_space(envs[0].action_space, len(envs))

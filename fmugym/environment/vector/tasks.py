@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fmugym.environment.vector.episodes import Episodes
 from fmugym.environment.vector.infos import add_ends, last_observations, merged, restricted
@@ -46,7 +45,6 @@ class VectorTask(ABC):
 
     way: str
 
-    _observed: npt.NDArray[np.float32] | None = None
     """The observations that the pool writes in its step; None for none."""
 
     def __init__(self, episodes: Episodes) -> None:
@@ -100,7 +98,7 @@ class VectorTask(ABC):
         taken = self._take_actions(actions, idle)
         self.has_moved = True
         started = None if fresh is None else self._start(fresh)
-        self._pool.step(None, idle, self._observed)
+        self._pool.step(None, idle)
         if resting is not None:
             self._pool.statuses[resting] = 0  # a fault was told when it came
         self._add_offsets(idle)

@@ -225,15 +225,12 @@ class ProcessPool(EnginePool):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
         with self._lock:
             if inputs is not None:
                 np.copyto(self.inputs, inputs)
             self._step(skip)
-            if observations is not None:
-                np.copyto(observations, self.observations)
             return self.outputs, self.statuses
 
     def step_own(self) -> int:

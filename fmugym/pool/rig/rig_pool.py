@@ -166,7 +166,6 @@ class BackendPool(CountedPool):
         self,
         inputs: FloatArray | None = None,
         skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.step``."""
         self._require_open()
@@ -178,8 +177,8 @@ class BackendPool(CountedPool):
             self._failures[index] = self._failures[index] or "it was not started by a reset"
         with self._halted_by_errors():
             self._advance(wanted & self._is_ready)
-        if observations is not None:
-            np.copyto(observations, self.outputs[: self._spec.num_observed].T, casting="same_kind")
+        observed = self.outputs[: self._spec.num_observed].T
+        np.copyto(self.observations, observed, casting="same_kind")
         return self.outputs, self.statuses
 
     def _advance(self, chosen: MaskArray) -> None:
@@ -219,7 +218,7 @@ class BackendPool(CountedPool):
 
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
-        self.step(None, None, self.observations)
+        self.step()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     def save_instances(self, indices: IndexArray) -> Bundle:
