@@ -142,8 +142,6 @@ class Pool:
             ``fmugym.pool.health``, int64.
         callback: Receives the number of an instance, the status, the category and the text of each
             message.
-        calls_python: Whether the FMU's code is Python. The handlers of signals that arrive while it
-            works run afterwards: the FMU would get what they raise.
 
     Raises:
         ValueError: If the form is damaged.
@@ -157,7 +155,6 @@ class Pool:
         form: bytes,
         arrays: tuple[Array, Array, Array, Array, Array],
         callback: Callable[[int, int, str, str], object],
-        calls_python: bool = False,
         /,
     ) -> Pool: ...
     def step(self, skip: Array | None, /) -> int:

@@ -44,7 +44,7 @@ def end_as_after_ctrl_c() -> None:
     """Let signals raise ``SignalledEnd``, except those that the process ignores (``nohup``).
 
     To be called in the main thread. While an FMU works whose code is Python, they only note that
-    they shall; see ``native/python/handlers.c``.
+    they shall; see ``fmugym.pool.held_signals``.
     """
     numbers = {
         number

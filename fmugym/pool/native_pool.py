@@ -18,7 +18,7 @@ import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,7 @@ from fmugym.pool.engine import (
 )
 from fmugym.pool.failure_texts import FRESH_PROCESSES, REFUSED_ANEW, Receiver, loading_failed
 from fmugym.pool.health import new_arrays, no_counts
+from fmugym.pool.held_signals import undisturbed
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.pool import (
@@ -145,11 +146,13 @@ class NativePool(EnginePool):
             records=keeps_records(description, spec),
         )
         arrays = self.inputs, self.outputs, self.statuses, self.observations, self._counts
+        make = undisturbed(_native.Pool) if fmu.calls_python() else _native.Pool
         try:
-            return _native.Pool(form, arrays, Receiver(log, description), fmu.calls_python())
+            pool = make(form, arrays, Receiver(log, description))
         except OSError as error:
             text = loading_failed(fmu.path.name, str(error), fmu.extract(), FRESH_PROCESSES)
             raise FMULoadError(text) from None
+        return cast(_native.Pool, _Undisturbed(pool)) if fmu.calls_python() else pool
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""
@@ -285,6 +288,20 @@ class NativePool(EnginePool):
         prepare(pool, self._access(variables), *parts)
         step, start = self._starting_play
         return Play(pool.check_actions, pool.play_before, pool.play_after, pool.play, step, start)
+
+
+class _Undisturbed:
+    """A pool of the extension whose FMU is Python code: signals are held while it works.
+
+    Args:
+        pool: The pool.
+    """
+
+    def __init__(self, pool: _native.Pool) -> None:
+        self._pool = pool
+
+    def __getattr__(self, name: str) -> Any:
+        return undisturbed(getattr(self._pool, name))
 
 
 def prepare(

@@ -2,7 +2,6 @@
 
 #include <string.h>
 
-#include "python/handlers.h"
 #include "python/programs.h"
 
 #include "pool/threads.h"
@@ -82,7 +81,7 @@ PyMODINIT_FUNC PyInit__native(void) {
         return NULL;
     }
     pool_prepare_process();
-    if (!handlers_prepare() || !add_type(module, &access_type, &access_spec) ||
+    if (!add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {

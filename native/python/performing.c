@@ -3,7 +3,7 @@
 #include <string.h>
 
 #include "pool/inside.h"
-#include "python/handlers.h"
+#include "python/python.h"
 
 PyObject *find_object(const char *module_name, const char *name) {
     PyObject *module = PyImport_ImportModule(module_name);
@@ -129,7 +129,7 @@ static void work_and_leave(PyPool *self, Work *work, void *context, Signals *sig
     pool_leave(&self->pool);
 }
 
-static bool enter_and_work(PyPool *self, int length, Work *work, void *context) {
+bool perform(PyPool *self, int length, Work *work, void *context) {
     Entry entry = pool_try_enter(&self->pool);
     Signals signals = {0};
 
@@ -148,17 +148,4 @@ static bool enter_and_work(PyPool *self, int length, Work *work, void *context) 
         return false;
     }
     return explain_entry(entry);
-}
-
-bool perform(PyPool *self, int length, Work *work, void *context) {
-    Held held;
-
-    if (!self->calls_python) {
-        return enter_and_work(self, length, work, context);
-    }
-    if (!handlers_hold(&held)) {
-        return false;
-    }
-    const bool done = enter_and_work(self, length, work, context);
-    return handlers_release(&held) && done;
 }

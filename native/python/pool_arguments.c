@@ -34,9 +34,9 @@ bool take_pool_arguments(PyPool *self, PyObject *args) {
     Py_ssize_t size;
 
     self->arguments = Py_NewRef(args);
-    if (!PyArg_ParseTuple(args, "y#(OOOOO)O|p:Pool", &form, &size, &arrays[INPUTS], &arrays[OUTPUTS],
+    if (!PyArg_ParseTuple(args, "y#(OOOOO)O:Pool", &form, &size, &arrays[INPUTS], &arrays[OUTPUTS],
                           &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
-                          &self->callback, &self->calls_python) ||
+                          &self->callback) ||
         !take_form(self, form, size) || !take_arrays(self, arrays)) {
         return false;
     }

@@ -3,7 +3,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "python/handlers.h"
+#include "python/python.h"
 
 /* Closing */
 
@@ -18,20 +18,15 @@ static Entry enter_and_close(PyPool *self) {
     Py_END_ALLOW_THREADS return entry;
 }
 
-/* Returns false with an exception if this or reporting the last messages was interrupted, or if an FMU
- * closes its own pool. */
+/* Returns false with an exception if reporting the last messages was interrupted, or if an FMU closes
+ * its own pool. */
 static bool close_pool(PyPool *self) {
-    Held held = {.count = 0};
-
-    if (self->calls_python && !handlers_hold(&held)) {
-        return false;
-    }
     const Entry entry = enter_and_close(self);
-    const bool undisturbed = handlers_release(&held);
+
     if (entry != ENTRY_ENTERED) {
-        return undisturbed && (entry == ENTRY_CLOSED || explain_entry(entry));
+        return entry == ENTRY_CLOSED || explain_entry(entry);
     }
-    const bool reported = undisturbed && report_messages(self);
+    const bool reported = report_messages(self);
     log_close(&self->pool.log);
     return reported;
 }
@@ -47,15 +42,12 @@ static PyObject *py_close(PyObject *object, PyObject *unused) {
 /* An exception may already be set when this is called. This function cannot raise another one. */
 static void close_at_the_end(PyPool *self) {
     PyObject *type, *value, *traceback;
-    Held held;
 
     PyErr_Fetch(&type, &value, &traceback);
-    handlers_hold_at_the_end(&held);
     if (!close_pool(self)) {
         PyErr_WriteUnraisable(NULL);
     }
     pool_dispose(&self->pool);
-    handlers_postpone(&held);
     PyErr_Restore(type, value, traceback);
 }
 
@@ -82,15 +74,11 @@ static void pool_dealloc(PyObject *object) {
 static bool open_pool(PyPool *self) {
     char error[8192];
     bool opened;
-    Held held = {.count = 0};
 
-    if (self->calls_python && !handlers_hold(&held)) {
-        return false;
-    }
     self->opened = true;
     Py_BEGIN_ALLOW_THREADS opened = pool_open(&self->pool, &self->opening.settings, error,
                                                 sizeof error);
-    Py_END_ALLOW_THREADS if (!handlers_release(&held) || !report_messages(self)) {
+    Py_END_ALLOW_THREADS if (!report_messages(self)) {
         return false;
     }
     if (!opened) {

@@ -28,7 +28,6 @@ typedef struct {
 typedef struct {
     PyObject_HEAD Pool pool;
     bool opened;         /* whether the pool may need closing */
-    int calls_python;    /* whether the FMU's code is Python, in which signals must not end up */
     Opening opening;
     PyObject *arguments; /* keeps the arrays and the callback alive */
     PyObject *callback;

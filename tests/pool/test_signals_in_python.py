@@ -24,7 +24,7 @@ import pytest
 import fmugym
 from fmugym import FMU
 from fmugym.environment.vector import FMUVectorEnv
-from fmugym.pool.rig.fmpy_pool import signals_held
+from fmugym.pool.held_signals import signals_held
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
@@ -177,7 +177,7 @@ class TestAtOnce:
             collections.deque(calls, 0)
             time.sleep(1)
 
-    def test_what_fmpy_calls(self):
+    def test_a_call(self):
         def call():
             with signals_held():
                 pass
@@ -189,10 +189,7 @@ class TestAtOnce:
     def test_the_end_of_a_pool(self, fmu):
         pool = pool_tools.open_pool(FMU(fmu), ("u",), ("y",), n=2)
         pool_tools.start(pool)
-        pool._close.detach()
-        left = [pool._pool]
-        del pool
-        self.interrupted(left.clear)
+        self.interrupted(pool.close)
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

@@ -4,10 +4,6 @@ The logger of FMI 1.0 and 2.0 has a variable number of arguments, which ctypes c
 a native proxy that formats the text, but it knows one receiver per process. So there is one for all
 instances, which lives as long as the process and knows them by their names. From it, messages go to
 Python's ``logging``.
-
-The code of an FMU may be Python. Python runs the handlers of signals between any two of its
-instructions on the main thread, also between those of such an FMU. What a handler raises there, as
-for Ctrl-C, goes to the FMU, and is lost. So signals are held during a call.
 """
 
 from __future__ import annotations
@@ -17,12 +13,9 @@ import ctypes
 import functools
 import itertools
 import logging
-import signal
-import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 from weakref import WeakValueDictionary
@@ -39,6 +32,7 @@ from fmugym.fmi.status import Status, failed_call, sane
 from fmugym.fmi.variable import Variable
 from fmugym.pool.c_extension import needs_engine
 from fmugym.pool.failure_texts import Message, as_log_record, quoted
+from fmugym.pool.held_signals import signals_held
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.pool_spec import START_TIME, PoolSpec
 from fmugym.pool.rig.rig import FaultError
@@ -50,41 +44,7 @@ __all__ = [
     "fmi1_callbacks",
     "fmi2_callbacks",
     "fmpy_pool",
-    "signals_held",
 ]
-
-
-@contextmanager
-def signals_held() -> Iterator[None]:
-    """Run the handlers of signals that arrive in a ``with`` block after it."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # other threads run no handlers
-        return
-    noted: list[signal.Signals] = []
-    handlers: dict[signal.Signals, Callable[[int, Any], Any]] = {}
-    try:
-        for number in signal.valid_signals():
-            handler = signal.getsignal(number)
-            if callable(handler):
-                handlers[number] = handler
-                signal.signal(number, lambda number, _: noted.append(signal.Signals(number)))
-        yield
-    finally:
-        _give_back(handlers)
-        for number in noted:
-            handlers[number](number, sys._getframe())
-
-
-def _give_back(handlers: dict[signal.Signals, Callable[[int, Any], Any]]) -> None:
-    """Set all handlers again, although one that is back already may raise meanwhile."""
-    left = dict(handlers)
-    try:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-            del left[number]
-    finally:
-        if left:
-            _give_back(left)
 
 
 _ids = itertools.count(1)
