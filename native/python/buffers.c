@@ -17,6 +17,9 @@ static const ItemType types[] = {
     [ITEM_FLOAT64] = {"float64", "d", 8}, [ITEM_FLOAT32] = {"float32", "f", 4},
     [ITEM_INT64] = {"int64", "lq", 8},    [ITEM_UINT64] = {"uint64", "LQ", 8},
     [ITEM_INT8] = {"int8", "b", 1},       [ITEM_BOOLEAN] = {"bool", "?", 1},
+    [ITEM_FLOAT16] = {"float16", "e", 2}, [ITEM_INT16] = {"int16", "h", 2},
+    [ITEM_INT32] = {"int32", "il", 4},    [ITEM_UINT8] = {"uint8", "B", 1},
+    [ITEM_UINT16] = {"uint16", "H", 2},   [ITEM_UINT32] = {"uint32", "IL", 4},
 };
 
 static bool has_type(const Py_buffer *buffer, const ItemType *type) {
@@ -71,17 +74,20 @@ static void refuse_shape(const char *name, const Py_buffer *buffer, int dimensio
     PyErr_Format(PyExc_ValueError, "%s must have the shape %s, not %s", name, expected, actual);
 }
 
-/* The shape holds as many lengths as dimensions says. */
-static bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
-                        int dimensions, const Py_ssize_t *shape) {
-    static const int flags[] = {[COPIED] = PyBUF_STRIDES,
-                                [IN_PLACE] = PyBUF_C_CONTIGUOUS,
-                                [WRITTEN] = PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE};
+Item item_of(int letter, size_t size) {
+    Item item = 0;
+
+    while (item < ITEMS && ((size_t)types[item].size != size ||
+                            strchr(types[item].formats, letter) == NULL)) {
+        item++;
+    }
+    return item;
+}
+
+bool buffer_fits(const Py_buffer *buffer, Use use, const char *name, Item item, int dimensions,
+                 const Py_ssize_t *shape) {
     const ItemType *type = &types[item];
 
-    if (PyObject_GetBuffer(object, buffer, flags[use] | PyBUF_FORMAT) < 0) {
-        return false;
-    }
     if (!has_type(buffer, type)) {
         PyErr_Format(PyExc_TypeError, "%s must be an array of %s, not of type '%s' with %zd bytes",
                      name, type->name, buffer->format == NULL ? "B" : buffer->format,
@@ -94,8 +100,22 @@ static bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char
     } else {
         return true;
     }
-    PyBuffer_Release(buffer);
     return false;
+}
+
+static bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
+                        int dimensions, const Py_ssize_t *shape) {
+    static const int flags[] = {[COPIED] = PyBUF_STRIDES,
+                                [IN_PLACE] = PyBUF_C_CONTIGUOUS,
+                                [WRITTEN] = PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE};
+    if (PyObject_GetBuffer(object, buffer, flags[use] | PyBUF_FORMAT) < 0) {
+        return false;
+    }
+    if (!buffer_fits(buffer, use, name, item, dimensions, shape)) {
+        PyBuffer_Release(buffer);
+        return false;
+    }
+    return true;
 }
 
 bool take_vector(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,

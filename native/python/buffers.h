@@ -14,7 +14,14 @@ typedef enum {
     ITEM_INT64,
     ITEM_UINT64,
     ITEM_INT8,
-    ITEM_BOOLEAN
+    ITEM_BOOLEAN,
+    ITEM_FLOAT16,
+    ITEM_INT16,
+    ITEM_INT32,
+    ITEM_UINT8,
+    ITEM_UINT16,
+    ITEM_UINT32,
+    ITEMS
 } Item;
 
 typedef enum {
@@ -31,6 +38,15 @@ bool take_vector(PyObject *object, Py_buffer *buffer, Use use, const char *name,
                  Py_ssize_t length);
 bool take_matrix(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
                  Py_ssize_t rows, Py_ssize_t columns);
+
+/* The type of items with this letter of the module struct and so many bytes, or ITEMS if there is
+ * none. */
+Item item_of(int letter, size_t size);
+
+/* Whether a buffer is such an array; otherwise sets an exception whose text begins with the name. The
+ * shape has as many lengths as dimensions says. */
+bool buffer_fits(const Py_buffer *buffer, Use use, const char *name, Item item, int dimensions,
+                 const Py_ssize_t *shape);
 
 /* Releases a buffer, if there is one. */
 void release_buffer(Py_buffer *buffer);

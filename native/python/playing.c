@@ -120,25 +120,26 @@ static bool take_shape(PyPool *self, Playing *playing, PyObject *shape) {
 
 static bool take_kept_actions(PyPool *self, Playing *playing, PyObject *object, int number,
                               char **actions) {
-    const Actions *a = &playing->form.play.actions;
     Py_buffer *buffer = &playing->buffers[number];
+    const size_t count = self->pool.settings.count * playing->form.play.actions.elements;
 
-    if (!take_numbers(object, buffer, true, "actions to keep",
-                      (Py_ssize_t)(self->pool.settings.count * a->elements))) {
+    if (!take_vector(object, buffer, WRITTEN, "actions to keep", playing->action_item,
+                     (Py_ssize_t)count)) {
         return false;
     }
     *actions = buffer->buf;
-    if ((size_t)buffer->itemsize != a->size) {
-        PyErr_SetString(PyExc_ValueError, "actions differ in type");
-    }
-    return (size_t)buffer->itemsize == a->size;
+    return true;
 }
 
 /* The memory is that for the actions of this step, and of the one before. */
 static bool take_actions(PyPool *self, Playing *playing, const Parts *p) {
     Actions *a = &playing->form.play.actions;
 
-    playing->action_letter = p->letter;
+    playing->action_item = item_of(p->letter, a->size);
+    if (playing->action_item == ITEMS) {
+        PyErr_Format(PyExc_ValueError, "actions have no type '%c' of %zu bytes", p->letter, a->size);
+        return false;
+    }
     return take_shape(self, playing, p->shape) &&
            take_kept_actions(self, playing, p->current, CURRENT, &a->current) &&
            take_kept_actions(self, playing, p->previous, PREVIOUS, &a->previous);

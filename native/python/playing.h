@@ -23,7 +23,8 @@ typedef struct {
     PlayForm form;
     PyRows rows;
     Py_buffer buffers[PLAY_BUFFERS];
-    int action_letter, action_dimensions;
+    Item action_item;
+    int action_dimensions;
     Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;

@@ -2,19 +2,7 @@
 
 #include "python/playing.h"
 
-#include <stdint.h>
 #include <string.h>
-
-/* Whether the items of a buffer are of numpy's type with this letter; it has two for int64. */
-static bool has_letter(const Py_buffer *buffer, int letter) {
-    const char *format = buffer->format == NULL ? "B" : buffer->format;
-
-    if (*format == '@' || *format == '=') {
-        format++;
-    }
-    const bool is_long = *format == 'l' && letter == 'q'; /* of 8 bytes, as the caller sees */
-    return *format != '\0' && format[1] == '\0' && (*format == letter || is_long);
-}
 
 static bool is_of_one(const Playing *playing) {
     return playing->results != NULL && results_are_of_one(playing->results);
@@ -25,17 +13,8 @@ static bool take_array(const Playing *playing, PyObject *actions, Py_buffer *b) 
         return false;
     }
     const int first = is_of_one(playing) && b->ndim == playing->action_dimensions - 1;
-    bool fits = b->ndim == playing->action_dimensions - first &&
-                has_letter(b, playing->action_letter) &&
-                b->itemsize == (Py_ssize_t)playing->form.play.actions.size;
-    for (int i = 0; fits && i < b->ndim; i++) {
-        fits = b->shape[i] == playing->action_shape[first + i];
-    }
-    if (!fits || (uintptr_t)b->buf % (uintptr_t)b->itemsize != 0) {
-        PyErr_SetString(PyExc_TypeError, "the actions have another type or shape");
-        return false;
-    }
-    return true;
+    return buffer_fits(b, IN_PLACE, "the actions", playing->action_item,
+                       playing->action_dimensions - first, playing->action_shape + first);
 }
 
 static bool take_integer(PyObject *action, PyTurn *t) {

@@ -5,20 +5,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char *name,
-                  Py_ssize_t length) {
-    const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (written ? PyBUF_WRITABLE : 0);
-
-    if (PyObject_GetBuffer(object, buffer, flags) < 0) {
-        return false;
-    }
-    if (buffer->ndim == 1 && buffer->shape[0] == length && buffer->itemsize <= 8) {
-        return true;
-    }
-    PyErr_Format(PyExc_ValueError, "%s must be a vector of %zd numbers", name, length);
-    return false;
-}
-
 /* A row may be an element of an array that has the instances on its first axis. */
 static bool take_row(PyObject *object, Py_ssize_t length, Py_buffer *buffer, Row *row) {
     if (PyObject_GetBuffer(object, buffer, PyBUF_STRIDES | PyBUF_FORMAT | PyBUF_WRITABLE) < 0) {

@@ -20,10 +20,6 @@ typedef struct {
 bool take_rows(PyObject *tuple, Py_ssize_t length, PyRows *rows);
 void release_rows(PyRows *rows);
 
-/* Takes a vector with any type of numbers. */
-bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char *name,
-                  Py_ssize_t length);
-
 /* Functions of the module */
 PyObject *py_evaluate(PyObject *module, PyObject *args);
 PyObject *py_serve(PyObject *module, PyObject *args);
