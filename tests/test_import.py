@@ -17,7 +17,7 @@ HEAVY = (
 
 OPTIONAL = (
     *("cli", "control.identification", "deployment", "fmi.systems.ssp_archive"),
-    *("fmi.source_compiler", "fmi.stand_in", "lab", "records", "training"),
+    *("fmi.source_compiler", "fmi.fortran_libraries", "lab", "records", "training"),
 )
 
 

@@ -74,7 +74,7 @@ SLOW_MODULES = {
     "test_shared_data",
     "test_snapshot_machine",
     "test_soak",
-    "test_stand_in",
+    "test_fortran_libraries",
     "test_start_times",
     "test_strings",
     "test_surrogate",

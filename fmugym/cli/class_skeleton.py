@@ -21,7 +21,7 @@ import numpy as np
 from fmugym.cli.overview import typed_start
 from fmugym.errors import ConfigError, FMULoadError, plain
 from fmugym.fmi.fmu import FMU
-from fmugym.fmi.stand_in import replaceable
+from fmugym.fmi.fortran_libraries import replaceable
 from fmugym.fmi.systems.system_description import SystemDescription
 from fmugym.fmi.variable import Variable
 

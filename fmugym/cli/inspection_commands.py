@@ -42,8 +42,8 @@ from fmugym.cli.task_proposal import Proposal, preload_line
 from fmugym.cli.validation import validate
 from fmugym.errors import ConfigError, FMUGymError, plain, reason
 from fmugym.fmi.fmu import FMU
+from fmugym.fmi.fortran_libraries import build_stand_in, replaceable
 from fmugym.fmi.source_compiler import compile_fmu
-from fmugym.fmi.stand_in import build_stand_in, replaceable
 from fmugym.fmi.systems import FMUSystem
 from fmugym.task import Task, load
 from fmugym.task.data_rows import DataRows, read_rows, standard_time, usual_distance

@@ -28,7 +28,7 @@ import fmpy
 from fmugym.checks import KnownArguments, check_mapping, check_number, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, plain, printable, shown, warn_once
 from fmugym.files import is_own
-from fmugym.fmi import loader
+from fmugym.fmi import system_loader
 from fmugym.fmi.binaries import check_library
 from fmugym.fmi.bundled import is_bundled
 from fmugym.fmi.description import INTERFACES, Feedthrough, read_feedthrough
@@ -379,9 +379,9 @@ class FMU(KnownArguments):
         folder = self.extract()
         for path in {path: None for fmu, _ in self.libraries_in(folder) for path in fmu.preload}:
             load_globally(path)
-        self.require_libraries(folder, loader.ask)
+        self.require_libraries(folder, system_loader.ask)
         for name, path in self.libraries_before(folder):
-            if name and loader.ask([name]):
+            if name and system_loader.ask([name]):
                 load_globally(path)
         return [library for _, library in self.libraries_in(folder)]
 

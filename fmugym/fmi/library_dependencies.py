@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fmugym.errors import FMULoadError
-from fmugym.fmi import loader
+from fmugym.fmi import system_loader
 from fmugym.fmi.binaries import opened
 
 __all__ = [
@@ -52,7 +52,7 @@ class _Needed(NamedTuple):
 def missing_libraries(
     library: Path,
     provided: Iterable[str] = (),
-    ask: Callable[[Sequence[str]], list[str]] = loader.ask,
+    ask: Callable[[Sequence[str]], list[str]] = system_loader.ask,
 ) -> list[str]:
     """Find the shared libraries that a library needs and the system's loader would not find.
 
@@ -65,7 +65,7 @@ def missing_libraries(
     Args:
         library: The library, extracted.
         provided: Paths or names of libraries that will be loaded before.
-        ask: Asks the loader: ``fmugym.fmi.loader.ask`` or ``ask_in_a_child``.
+        ask: Asks the loader: ``fmugym.fmi.system_loader.ask`` or ``ask_in_a_child``.
 
     Returns:
         Their names. Empty on systems other than Linux, where the loader has to report them.
@@ -89,7 +89,7 @@ def ask_in_a_child(names: Sequence[str]) -> list[str]:
         return []
     with suppress(OSError, ValueError, subprocess.SubprocessError):
         done = subprocess.run(
-            [sys.executable, "-I", "-S", loader.__file__],
+            [sys.executable, "-I", "-S", system_loader.__file__],
             input=json.dumps(list(names)).encode(),
             capture_output=True,
             timeout=_TIMEOUT_OF_A_CHILD,

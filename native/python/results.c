@@ -5,7 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "python/arrays.h"
+#include "python/reused_arrays.h"
 
 struct Results {
     bool are_of_one;

@@ -22,7 +22,7 @@ BLOCKS = [
     for block in re.findall(
         r"^```bash\n(fmugym .*?)^```", (ROOT / "docs" / page).read_text(), re.M | re.S
     )
-    if "stand-in" not in block  # takes an old FMU; tests/fmi/test_stand_in.py has one
+    if "stand-in" not in block  # takes an old FMU; tests/fmi/test_fortran_libraries.py has one
 ]
 NEEDS = {
     "--algorithm": "stable_baselines3",

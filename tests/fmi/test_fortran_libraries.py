@@ -14,9 +14,9 @@ from fmu_tools import HERE, edited_fmu, library_name
 from process_tools import run_python
 
 from fmugym import FMU, ConfigError, Task, extras
-from fmugym.fmi import stand_in
+from fmugym.fmi import fortran_libraries
 from fmugym.fmi.library_dependencies import ask_in_a_child, missing_libraries
-from fmugym.fmi.loader import ask
+from fmugym.fmi.system_loader import ask
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
 DOCUMENT = HERE.parent / "docs" / "foreign-fmus.md"
@@ -44,7 +44,7 @@ def fmu_path(request, probe, tmp_path_factory):
     """The probe, with a library that needs an old libgfortran as it is loaded."""
     folder = tmp_path_factory.mktemp("old")
     name = "libgfortran.so.4" if request.param == "unversioned" else request.param
-    old_library(folder, name, stand_in.LIBRARIES[name], request.param != "unversioned")
+    old_library(folder, name, fortran_libraries.LIBRARIES[name], request.param != "unversioned")
     sources = ["-DFMI_VERSION=2", HERE / "sources/probe.c", HERE / "sources/old_fortran.c"]
     subprocess.run([*ZIG, *sources, name, "-lm", "-o", "Probe.so"], cwd=folder, check=True)
     add = {library_name(2): (folder / "Probe.so").read_bytes()}
@@ -94,7 +94,7 @@ def compiler(request, monkeypatch, tmp_path):
     indirect=["fmu_path", "compiler"],
 )
 def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, ran):
-    (name,) = stand_in.replaceable(FMU(fmu_path))
+    (name,) = fortran_libraries.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
     (command,) = re.findall(
         r"^fmugym (info --repair model.fmu .* lib)$", DOCUMENT.read_text(), re.MULTILINE
@@ -113,7 +113,7 @@ def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path,
 
 
 def test_what_the_stand_in_lacks_ends_the_trial_with_its_name(fmu_path, tmp_path):
-    (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
+    (built,) = fortran_libraries.build_stand_in(FMU(fmu_path), tmp_path)
     assert built.lacking == ("_gfortran_matmul_r8",)
     environment = {"CALL_MATMUL": "1", "FMUGYM_CACHE_DIR": str(tmp_path)}  # nobody has met it
     said = play(fmu_path, environment, preload=[str(built.path)])
@@ -167,7 +167,7 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
 
 def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, ran):
     (name,) = FMU(fmu_path).missing_libraries
-    (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
+    (built,) = fortran_libraries.build_stand_in(FMU(fmu_path), tmp_path)
     assert play(fmu_path, preload=[str(built.path)]) == STEPPED
     said = ran("info", fmu_path)
     assert "restore is right" in said
@@ -180,7 +180,7 @@ def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(
     fmu_path, probe, tmp_path, refused
 ):
     with pytest.raises(ConfigError, match=r"Probe.fmu lacks neither libgfortran.so.3 nor"):
-        stand_in.build_stand_in(FMU(probe()), tmp_path)
+        fortran_libraries.build_stand_in(FMU(probe()), tmp_path)
     (name,) = FMU(fmu_path).missing_libraries
     (tmp_path / name).write_text("precious")
     assert "exists already" in refused("info", "--repair", fmu_path, "--output", tmp_path)
@@ -195,14 +195,14 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, ran):
     ran("info", "--repair", fmu_path, "--output", "a/b")
     assert (tmp_path / "a" / "b" / name).is_file()
     with pytest.raises(ConfigError, match="cannot hold libraries"):
-        stand_in.build_stand_in(FMU(fmu_path), tmp_path / name / "inside")
+        fortran_libraries.build_stand_in(FMU(fmu_path), tmp_path / name / "inside")
 
 
 def test_without_a_compiler(fmu_path, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"needs a C compiler: install gcc .* or ziglang"):
-        stand_in.build_stand_in(FMU(fmu_path), tmp_path)
+        fortran_libraries.build_stand_in(FMU(fmu_path), tmp_path)
 
 
 class TestTransitively:

@@ -1,6 +1,6 @@
 /* Arrays of numpy, which are used again as soon as nobody else holds them. */
 
-#include "python/arrays.h"
+#include "python/reused_arrays.h"
 
 #include <math.h>
 #include <string.h>

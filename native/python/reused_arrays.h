@@ -1,7 +1,7 @@
 /* Arrays of numpy that are used again as soon as nobody else holds them. */
 
-#ifndef FMUGYM_ARRAYS_H
-#define FMUGYM_ARRAYS_H
+#ifndef FMUGYM_REUSED_ARRAYS_H
+#define FMUGYM_REUSED_ARRAYS_H
 
 #include "python/python.h"
 

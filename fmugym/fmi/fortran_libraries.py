@@ -98,12 +98,12 @@ def _build(fmu: FMU, path: Path) -> StandIn:
 def _compile(path: Path, symbols: Mapping[str, str]) -> None:
     with tempfile.TemporaryDirectory(prefix="fmugym-stand-in-") as name:
         folder = Path(name)
-        (folder / "stand_in.c").write_text(_source())
+        (folder / "fortran_libraries.c").write_text(_source())
         (folder / "lacking.c").write_text(_lacking(set(symbols) - _served()))
         (folder / "versions").write_text(_versions(symbols, LIBRARIES[path.name]))
         command = [
             *c_compiler("a stand-in"),
-            *("-shared", "-fPIC", "-O1", "-w", "stand_in.c", "lacking.c", "-o", "library"),
+            *("-shared", "-fPIC", "-O1", "-w", "fortran_libraries.c", "lacking.c", "-o", "library"),
             *(f"-Wl,-soname,{path.name}", "-Wl,--version-script=versions"),
         ]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
@@ -113,11 +113,11 @@ def _compile(path: Path, symbols: Mapping[str, str]) -> None:
 
 
 def _source() -> str:
-    return (resources.files("fmugym.fmi") / "stand_in.c").read_text()
+    return (resources.files("fmugym.fmi") / "fortran_libraries.c").read_text()
 
 
 def _served() -> set[str]:
-    """The functions of ``stand_in.c``."""
+    """The functions of ``fortran_libraries.c``."""
     return set(re.findall(r"^\w+ (_gfortran_\w+)\(", _source(), re.MULTILINE))
 
 

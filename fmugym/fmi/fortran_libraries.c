@@ -1,7 +1,7 @@
 /* A stand-in for libgfortran 3 and 4, the run-time library of gfortran before GCC 8.
  *
  * It has the functions that numerical libraries call now and then: strings, powers, clocks, and
- * messages on the terminal. fmugym/fmi/stand_in.py adds the other functions that an FMU asks for;
+ * messages on the terminal. fmugym/fmi/fortran_libraries.py adds the other functions that an FMU asks for;
  * they end the process with a message, so that nothing is computed wrongly. Calling conventions:
  * libgfortran's sources of GCC 4 to 7, where the length of a string is an int. */
 
