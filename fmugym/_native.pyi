@@ -38,15 +38,6 @@ def evaluate(
 def distributions() -> tuple[str, ...]:
     """The kinds of distributions, in the order of their numbers."""
 
-def seed(states: Array, indices: Array, words: bytes, /) -> None:
-    """Seed M random streams as ``numpy.random.PCG64`` does.
-
-    Args:
-        states: The streams, uint64, shape (N, 6).
-        indices: Which of them, int64, shape (M,).
-        words: The seeds, the same number of 32-bit words for each, the lowest first.
-    """
-
 def statistics() -> dict[str, int]:
     """What helper threads have done in this process.
 
@@ -108,12 +99,11 @@ class Draws:
     """
 
     def __new__(cls, form: bytes, standard_normal: int, exponential: int = ..., /) -> Draws: ...
-    def take(self, states: Array, indices: Array, values: Array, /) -> None:
+    def take(self, states: Array, values: Array, /) -> None:
         """Draw an episode from each of M streams; ``given`` values stay.
 
         Args:
-            states: The streams, uint64, shape (N, 6).
-            indices: Which of them, int64, shape (M,).
+            states: The streams, uint64, shape (M, 6).
             values: Filled, float64, shape (draws, M).
         """
 

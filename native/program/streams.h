@@ -1,4 +1,4 @@
-/* Random streams with the numbers of numpy's generator PCG64, seeded by numpy's SeedSequence. */
+/* Random streams with the numbers of numpy's generator PCG64, which also seeds them. */
 
 #ifndef FMUGYM_STREAMS_H
 #define FMUGYM_STREAMS_H
@@ -15,10 +15,6 @@ typedef struct {
 } Stream;
 
 enum { STREAM_NUMBERS = sizeof(Stream) / sizeof(uint64_t) };
-
-/* Seeds a stream with an integer. Its 32-bit words begin with the lowest; leading zeros do not
- * count. */
-void stream_seed(Stream *stream, const uint32_t *words, size_t count);
 
 uint64_t stream_next_64(Stream *stream);
 uint32_t stream_next_32(Stream *stream);

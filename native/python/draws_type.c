@@ -1,4 +1,4 @@
-/* The type Draws: the distributions of an episode. Also the seeding of random streams. */
+/* The type Draws: the distributions of an episode. */
 
 #include "program/program_form.h"
 #include "python/python.h"
@@ -48,97 +48,33 @@ static void draws_dealloc(PyObject *object) {
     Py_DECREF(type);
 }
 
-/* Streams, and which of them to use */
-
-typedef struct {
-    Py_buffer states, indices;
-} Chosen;
-
-static void release_chosen(Chosen *chosen) {
-    release_buffer(&chosen->states);
-    release_buffer(&chosen->indices);
-}
-
-static bool take_chosen(PyObject *states, PyObject *indices, Chosen *chosen) {
-    return take_matrix(states, &chosen->states, WRITTEN, "states", ITEM_UINT64, ANY_LENGTH,
-                       STREAM_NUMBERS) &&
-           take_vector(indices, &chosen->indices, IN_PLACE, "indices", ITEM_INT64, ANY_LENGTH);
-}
-
-/* The array of the indices may change at any time, so each is checked when it is used. */
-static Stream *stream_at(const Chosen *chosen, Py_ssize_t place) {
-    const int64_t index = ((const int64_t *)chosen->indices.buf)[place];
-
-    if (index < 0 || index >= chosen->states.shape[0]) {
-        PyErr_Format(PyExc_IndexError, "there is no stream %lld", (long long)index);
-        return NULL;
-    }
-    return (Stream *)chosen->states.buf + index;
-}
-
-static bool seed_chosen(const Chosen *chosen, PyObject *words) {
-    const Py_ssize_t count = chosen->indices.shape[0];
-    const size_t size = (size_t)PyBytes_Size(words) / sizeof(uint32_t);
-    const size_t width = count == 0 ? 0 : size / (size_t)count;
-    const uint32_t *seed = (const uint32_t *)PyBytes_AsString(words);
-
-    if ((size_t)PyBytes_Size(words) != (size_t)count * width * sizeof *seed) {
-        PyErr_SetString(PyExc_ValueError, "all seeds must have the same number of 32-bit words");
-        return false;
-    }
-    for (Py_ssize_t i = 0; i < count; i++, seed += width) {
-        Stream *stream = stream_at(chosen, i);
-        if (stream == NULL) {
-            return false;
-        }
-        stream_seed(stream, seed, width);
-    }
-    return true;
-}
-
-PyObject *py_seed(PyObject *module, PyObject *args) {
-    PyObject *states, *indices, *words;
-    Chosen chosen = {0};
-
-    (void)module;
-    if (!PyArg_ParseTuple(args, "OOS:seed", &states, &indices, &words)) {
-        return NULL;
-    }
-    const bool done = take_chosen(states, indices, &chosen) && seed_chosen(&chosen, words);
-    release_chosen(&chosen);
-    return done ? Py_NewRef(Py_None) : NULL;
-}
-
-static bool draw_chosen(const Draws *draws, const Chosen *chosen, const Py_buffer *values) {
-    const Py_ssize_t count = chosen->indices.shape[0];
+static void take_each(const Draws *draws, const Py_buffer *states, const Py_buffer *values) {
+    const Py_ssize_t count = states->shape[0];
 
     for (Py_ssize_t i = 0; i < count; i++) {
-        Stream *stream = stream_at(chosen, i);
-        if (stream == NULL) {
-            return false;
-        }
-        BitGenerator bits = bits_of(stream);
+        BitGenerator bits = bits_of((Stream *)states->buf + i);
         draws_take(draws, &bits, (double *)values->buf + i, (size_t)count);
     }
-    return true;
 }
 
 static PyObject *draws_take_all(PyObject *object, PyObject *args) {
     const Draws *draws = &((PyDraws *)object)->draws;
-    PyObject *states, *indices, *array;
-    Chosen chosen = {0};
-    Py_buffer values = {0};
+    PyObject *streams, *array;
+    Py_buffer states = {0}, values = {0};
 
-    if (!PyArg_ParseTuple(args, "OOO:take", &states, &indices, &array)) {
+    if (!PyArg_ParseTuple(args, "OO:take", &streams, &array)) {
         return NULL;
     }
-    const bool done = take_chosen(states, indices, &chosen) &&
+    const bool good = take_matrix(streams, &states, WRITTEN, "states", ITEM_UINT64, ANY_LENGTH,
+                                  STREAM_NUMBERS) &&
                       take_matrix(array, &values, WRITTEN, "values", ITEM_FLOAT64,
-                                  (Py_ssize_t)draws->count, chosen.indices.shape[0]) &&
-                      draw_chosen(draws, &chosen, &values);
+                                  (Py_ssize_t)draws->count, states.shape[0]);
+    if (good) {
+        take_each(draws, &states, &values);
+    }
     release_buffer(&values);
-    release_chosen(&chosen);
-    return done ? Py_NewRef(Py_None) : NULL;
+    release_buffer(&states);
+    return good ? Py_NewRef(Py_None) : NULL;
 }
 
 static PyObject *list_of(const double *values, size_t count) {

@@ -51,7 +51,6 @@ static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
     {"distributions", distributions, METH_NOARGS, NULL},
-    {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},

@@ -73,9 +73,6 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_ask(PyObject *object, PyObject *args);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 
-/* A function of the module */
-PyObject *py_seed(PyObject *module, PyObject *args);
-
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_start(PyObject *object, PyObject *mask);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

@@ -322,15 +322,7 @@ class TestGuards:
         with pytest.raises(ValueError, match="too few rows"):
             draws.take_from(np.random.PCG64().capsule, np.empty(1))
 
-    def test_streams_that_do_not_exist(self):
-        from fmugym import _native
-
-        states = np.zeros((3, 6), np.uint64)
+    def test_values_for_other_streams(self):
         draws = draws_of(Uniform(0, 1)).native
-        for index in (-1, 3, 2**62):
-            with pytest.raises(IndexError, match="there is no stream"):
-                _native.seed(states, np.array([index]), bytes(4))
-            with pytest.raises(IndexError, match="there is no stream"):
-                draws.take(states, np.array([index]), np.empty((1, 1)))
-        with pytest.raises(ValueError, match="same number of 32-bit words"):
-            _native.seed(states, np.array([0, 1]), bytes(12))
+        with pytest.raises(ValueError, match="values must have the shape"):
+            draws.take(np.zeros((3, 6), np.uint64), np.empty((1, 2)))

@@ -29,9 +29,9 @@ class EpisodeStreams:
     """Draws the episodes of N environments from N random streams.
 
     Seeded with s, environment i draws what a single environment seeded with s + i draws, episode
-    after episode. A stream is the state of a ``numpy.random.PCG64``. The C extension
-    seeds the streams and draws from them; a generator of numpy takes the place of a stream only
-    for distributions that Python must draw.
+    after episode. A stream is the state of a ``numpy.random.PCG64``, which has seeded it. The C
+    extension draws from the streams; a generator of numpy takes the place of a stream only for
+    distributions that Python must draw.
 
     Args:
         num_envs: N.
@@ -82,19 +82,9 @@ class EpisodeStreams:
         self._seed({index: secrets.randbits(_SEED_BITS) for index in unseeded})
 
     def _seed(self, seeds: dict[int, int]) -> None:
-        by_size: dict[int, list[int]] = {}
         for index, seed in seeds.items():
             self._seeds[index] = seed
-            by_size.setdefault(4 * (seed.bit_length() // 32 + 1), []).append(index)
-        for size, indices in by_size.items():
-            self._seed_rows(indices, [seeds[index] for index in indices], size)
-
-    def _seed_rows(self, indices: list[int], seeds: list[int], size: int) -> None:
-        """Seed streams with integers of at most so many bytes."""
-        from fmugym import _native  # as all batches need it
-
-        words = np.frombuffer(b"".join([s.to_bytes(size, "little") for s in seeds]), "<u4")
-        _native.seed(self.states, np.array(indices), words.astype(np.uint32).tobytes())
+            self.states[index] = row_of(np.random.PCG64(seed).state)
 
     def draw(self, draws: EpisodeStart, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
@@ -108,7 +98,9 @@ class EpisodeStreams:
         self.require_seeds()
         values = np.empty((len(draws.drawn), len(indices)))
         if draws.native is not None:
-            draws.native.take(self.states, indices, values)
+            rows = self.states[indices]
+            draws.native.take(rows, values)
+            self.states[indices] = rows
             return values
         for place, index in enumerate(indices.tolist()):
             with self._as_generator(index) as generator:
