@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,6 +24,12 @@ __all__ = ["EpisodeStreams"]
 _NONE: Final = -1
 _SEED_BITS: Final = 128
 """The bits of entropy that numpy takes from the system where no seed is given."""
+
+
+@functools.lru_cache(maxsize=4096)
+def _seeded(seed: int) -> tuple[int, ...]:
+    """The state of a stream with a seed; searches play many candidates with the same seeds."""
+    return tuple(row_of(np.random.PCG64(seed).state))
 
 
 class EpisodeStreams:
@@ -84,7 +91,7 @@ class EpisodeStreams:
     def _seed(self, seeds: dict[int, int]) -> None:
         for index, seed in seeds.items():
             self._seeds[index] = seed
-            self.states[index] = row_of(np.random.PCG64(seed).state)
+            self.states[index] = _seeded(seed)
 
     def draw(self, draws: EpisodeStart, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
