@@ -17,6 +17,7 @@ from fmugym.expressions.program import (
     Program,
     Row,
     UncompilableError,
+    engine,
     letter_of,
     operation_of,
 )
@@ -50,7 +51,9 @@ def compile_graph(graph: Graph, stores: Sequence[Store]) -> Program:
 
     Raises:
         UncompilableError: If there are too many operations, or the pool does not have one of them.
+        ImportError: If the C extension was built from other sources than this package.
     """
+    engine()  # which numbers operations as this module does
     compiler = _Compiler(graph)
     rows = compiler.number_outputs(stores)
     for store, row in zip(stores, rows, strict=True):

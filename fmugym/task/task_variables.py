@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from fmugym.checks import Spellings, normal_form
-from fmugym.environment.distributions import Choice, Normal, Uniform, is_distribution
+from fmugym.environment.distributions import Choice, LogUniform, Normal, Uniform, is_distribution
 from fmugym.environment.fmu_variables import check_input, check_output, checked, spread, within
 from fmugym.errors import ConfigError, ConsequenceError, shown, unknown_name
 from fmugym.fmi.description import ModelDescription
@@ -418,6 +418,8 @@ def _in_unit_of_fmu(conversion: Conversion, value: Any) -> Any:
             low, high = sorted(map(conversion.inverse, (value.low, value.high)))
             std = value.std / abs(conversion.factor)
             return Normal(conversion.inverse(value.mean), std, low, high)
+        case LogUniform() if conversion.offset == 0.0 and conversion.factor > 0.0:
+            return LogUniform(conversion.inverse(value.low), conversion.inverse(value.high))
         case Choice():
             return Choice([*map(conversion.inverse, value.values)], value.probabilities)
     raise ConfigError(

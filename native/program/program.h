@@ -12,8 +12,8 @@
 
 enum { PROGRAM_REGISTERS = 256 /* maximum number of registers */ };
 
-/* OPERATIONS in fmugym/expressions/program.py lists their names in the same order. Importing
- * that module compares the two. The letters are those of numpy's types: d float64, f float32,
+/* OPERATIONS in fmugym/expressions/program.py lists their names in the same order. Who
+ * compiles a program compares the two. The letters are those of numpy's types: d float64, f float32,
  * q int64. Booleans are bytes, 0 or 1. Those that move values come first; arithmetic is from ADD_D
  * to WHERE_1; what takes longer is from SIN on, and has one operand until CBRT. */
 #define OPERATIONS_OF(X, T, letter)                                                                \

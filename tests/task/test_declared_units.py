@@ -231,6 +231,31 @@ class TestConversion:
         with pytest.raises(fmugym.ConfigError, match="T_op"):
             Endless(without_units(tmp_path), config | {"units": {"T_oq": "K"}})
 
+    @pytest.mark.parametrize(
+        "drawn",
+        [
+            {"distribution": "uniform", "low": 0.05, "high": 0.2},
+            {"distribution": "normal", "mean": 0.1, "std": 0.02},
+            {"distribution": "log_uniform", "low": 0.05, "high": 0.2},
+            {"distribution": "choice", "values": [0.05, 0.1, 0.2]},
+        ],
+        ids=lambda drawn: drawn["distribution"],
+    )
+    def test_of_what_is_drawn(self, drawn):
+        """In kW/K here; the house has W/K."""
+        numbers = {
+            name: 1e3 * np.array(value) if name != "distribution" else value
+            for name, value in drawn.items()
+        }
+        unit = {"u": {"min": 0, "max": 1}, "H_ve": {"unit": "kW/K"}}
+        found = []
+        for variables, given in ((unit, drawn), ({"u": unit["u"]}, numbers)):
+            plain = {key: np.asarray(value).tolist() for key, value in given.items()}
+            with house(variables=variables, parameters={"H_ve": plain}) as env:
+                found.append([env.reset(seed=seed)[1]["drawn"]["H_ve"] for seed in range(5)])
+        assert found[0] == pytest.approx(found[1], rel=1e-12)
+        assert 40 < min(found[0]) < max(found[0]) < 250
+
 
 class TestRefusals:
     @pytest.mark.parametrize(

@@ -45,8 +45,6 @@ class VectorTask(ABC):
 
     way: str
 
-    """The observations that the pool writes in its step; None for none."""
-
     def __init__(self, episodes: Episodes) -> None:
         self.episodes, self._pool = episodes, episodes.pool
         self.has_moved = False
