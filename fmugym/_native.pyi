@@ -14,11 +14,14 @@ Array = npt.NDArray[Any]
 MOST_REGISTERS: Final[int]
 """The most registers of a program."""
 
-def operations() -> tuple[str, ...]:
-    """The operations of programs, in the order of their numbers."""
+OPERATIONS: Final[tuple[str, ...]]
+"""The operations of programs, in the order of their numbers."""
+
+DISTRIBUTIONS: Final[tuple[str, ...]]
+"""The kinds of distributions, in the order of their numbers."""
 
 Program = tuple[bytes, tuple[Array, ...]]
-"""The form of a program, and its rows: ``Program.with_rows`` of ``fmugym.environment.vector``."""
+"""The form of a program, and its rows: ``Program.with_rows`` of ``fmugym.expressions.program``."""
 
 def evaluate(
     program: Program,
@@ -35,15 +38,12 @@ def evaluate(
         Whether an index was outside of its table.
     """
 
-def distributions() -> tuple[str, ...]:
-    """The kinds of distributions, in the order of their numbers."""
-
 def statistics() -> dict[str, int]:
     """What helper threads have done in this process.
 
     Returns:
-        ``jobs`` in which helpers could take part, ``wakes`` of helpers that slept, and ``chunks``
-        that these jobs were divided into.
+        ``jobs`` in which helpers could take part, ``wakes`` of helpers that slept, ``early_wakes``
+        before any item of the job was done, and ``chunks`` that these jobs were divided into.
     """
 
 def initializations() -> int:
@@ -99,11 +99,11 @@ class Draws:
     """
 
     def __new__(cls, form: bytes, standard_normal: int, exponential: int = ..., /) -> Draws: ...
-    def take(self, states: Array, values: Array, /) -> None:
+    def take(self, streams: Array, values: Array, /) -> None:
         """Draw an episode from each of M streams; ``given`` values stay.
 
         Args:
-            states: The streams, uint64, shape (M, 6).
+            streams: They change, uint64, shape (M, 6).
             values: Filled, float64, shape (draws, M).
         """
 
@@ -164,19 +164,17 @@ class Pool:
         rows: tuple[Array, ...],
         start: Access,
         start_values: Array,
-        shape: tuple[int, ...],
-        letter: str,
         current: Array,
         previous: Array,
         draws: Draws,
-        states: Array,
+        streams: Array,
         ended: Array,
         kept: Array,
         results: tuple[Any, ...],
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
-    def play(self, actions: Array, at_ends: bool, /) -> tuple[Any, ...]:
+    def play(self, actions: Array | int, at_ends: bool, /) -> tuple[Any, ...]:
         """Do a step, with all that was taken over; see ``Play.step`` of ``fmugym.pool.pool``.
 
         Raises:
@@ -185,17 +183,17 @@ class Pool:
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
-    def check_actions(self, actions: Array, /) -> None:
+    def check_actions(self, actions: Array | int, /) -> None:
         """Check actions as ``play`` does, and raise the same errors; nothing else is done."""
 
-    def play_before(self, actions: Array, /) -> None:
+    def play_before(self, actions: Array | int, /) -> None:
         """Do what comes before the FMUs' part of ``play``, where the caller steps them.
 
         The errors are those of ``play``. Where they run in other processes, the pool was made
         without paths of libraries.
         """
 
-    def play_after(self, actions: Array, /) -> tuple[Any, ...]:
+    def play_after(self) -> tuple[Any, ...]:
         """Do what comes after the FMUs' part of ``play``.
 
         The outputs and statuses are those that the pool's arrays have. The results and errors are
@@ -219,7 +217,7 @@ class Pool:
             states: These, if there are any.
 
         Returns:
-            The code and the content of the answer; the states that were saved as a list.
+            The code and the content of the answer; the states that were saved as a tuple.
 
         Raises:
             ValueError: If there is no such request.

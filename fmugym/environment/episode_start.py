@@ -57,7 +57,7 @@ def no_draws() -> Draws:
 def _draws(recipes: tuple[Recipe, ...], rows: tuple[int, ...]) -> Draws:
     from fmugym import _native
 
-    known = _native.distributions()
+    known = _native.DISTRIBUTIONS
     counts = [len(recipe.numbers) for recipe in recipes]
     firsts = np.cumsum([0, *counts])[:-1]
     columns = [known.index(recipe.kind) for recipe in recipes], rows, firsts, counts

@@ -80,7 +80,7 @@ def require_same_table(native: Any) -> None:
     Raises:
         ImportError: If they differ, because the extension was built from other sources.
     """
-    operations: Any = getattr(native, "operations", tuple)()
+    operations: Any = getattr(native, "OPERATIONS", ())
     if (operations, getattr(native, "MOST_REGISTERS", 0)) != (OPERATIONS, MOST_REGISTERS):
         raise ImportError(
             "the C extension fmugym._native was built from other sources than the Python code of "

@@ -323,11 +323,10 @@ def prepare(
         start: To the start variables, as for ``Pool.reset``.
         programs: From the actions to the inputs; from the outputs to all that follows; and from
             those at the start of an episode to observations and infos. See ``Program.with_rows``.
-        actions: How actions are checked and kept: the shape of one action; the letter of its
-            type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
-            from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
-            actions of this step and of the one before, flat, environments first;
-            what counts as the action of a new episode.
+        actions: How actions are checked and kept: the bytes of an element; the check (0 none, 1 the
+            range from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
+            actions of this step and of the one before, environments first, whose type and shape
+            actions must have; what counts as the action of a new episode, flat.
         start_values: As the values of ``reset``; the pool writes the draws there.
         draws: The draws of an episode, and the random streams, shape (N, 6); see
             ``EpisodeStreams``.
@@ -349,9 +348,9 @@ def prepare(
         start=start,
         start_values=start_values,
         draws=draws[0],
-        states=draws[1],
+        streams=draws[1],
         ended=ended,
-        **{name: actions[name] for name in ("shape", "letter", "current", "previous")},
+        **{name: actions[name] for name in ("current", "previous")},
         **{name: surroundings[name] for name in ("kept", "results")},
     )
 

@@ -47,7 +47,7 @@ class Play(NamedTuple):
         check: Refuses actions as ``step`` does: by a ``TypeError``, ``ValueError`` or
             ``BufferError``.
         before: Takes the actions, and makes the inputs.
-        after: Takes the same actions, and returns what ``step`` returns.
+        after: Returns what ``step`` returns, of the actions that ``before`` took.
         step: A function of actions and a flag; it does a step, and starts the episodes that have
             ended before it. If the flag is True, an episode that ends without a fault is followed
             by the next one in the same step. It returns seven values: how many instances had
@@ -66,7 +66,7 @@ class Play(NamedTuple):
 
     check: Callable[[Any], None]
     before: Callable[[Any], None]
-    after: Callable[[Any], Played]
+    after: Callable[[], Played]
     step: Callable[[Any, bool], Played] | None = None
     start_and_step: Callable[[Any, bool], Played] | None = None
     start: Callable[[Any], tuple[int, bool, tuple[Any, ...], Any, Any] | None] | None = None

@@ -181,26 +181,16 @@ WIDE static bool is_any(const uint8_t *flags, size_t count) {
     return any != 0;
 }
 
-/* Lists the environments of a run that start an episode instead of taking a step. */
-static size_t list_starting(const Play *play, size_t begin, size_t count, uint32_t *starting) {
-    size_t number = 0;
-
+void play_list_ended(const Play *play, size_t begin, size_t count, Listed *ended) {
+    ended->count = 0;
     if (!is_any(play->ended + begin, count)) {
-        return 0;
+        return;
     }
     for (size_t index = begin; index < begin + count; index++) {
         if (play->ended[index]) {
-            starting[number++] = (uint32_t)index;
+            ended->places[ended->count++] = (uint32_t)index;
         }
     }
-    return number;
-}
-
-void play_start_after_ended(const Turn *turn, size_t begin, size_t count) {
-    uint32_t starting[PROGRAM_WIDTH];
-    const size_t number = list_starting(turn->play, begin, count, starting);
-
-    play_start_episodes(turn, starting, number);
 }
 
 WIDE static size_t number_of(const uint8_t *flags, size_t count) {
@@ -222,19 +212,17 @@ static void add_notes(const Notes *notes, size_t count, Verdict *verdict) {
 }
 
 void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
-                PlayScratch *scratch, Verdict *verdict) {
+                   const Listed *starting, PlayScratch *scratch, Verdict *verdict) {
     const Play *play = turn->play;
     Source source = source_of(turn);
     Notes notes = {.outside = false};
-    uint32_t starting[PROGRAM_WIDTH];
-    const size_t number = list_starting(play, begin, count, starting);
 
     source.fresh = fresh;
     copy_rows(&play->before_conclusion, begin, count);
     program_run(&play->conclusion, &source, begin, count, &scratch->conclusion, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);
     add_notes(&notes, count, verdict);
-    start_rows(turn, &play->unstepped, starting, number);
+    start_rows(turn, &play->unstepped, starting->places, starting->count);
     verdict->ended += number_of(play->ended + begin, count);
 }
 

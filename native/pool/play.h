@@ -56,6 +56,9 @@ typedef struct {
     size_t count;
 } RowStarts;
 
+/* After the arrays of observations and infos, a step fills these: */
+enum { REWARDS_ARRAY, TERMINATED_ARRAY, TRUNCATED_ARRAY, STEP_ARRAYS };
+
 /* What stays the same from step to step. The owner provides all memory. */
 typedef struct {
     size_t count;
@@ -76,7 +79,6 @@ typedef struct {
     RowStarts starts;
     RowStarts unstepped; /* what the conclusion stores where an episode starts instead of a step */
     double *start_values; /* a row for each start variable */
-    size_t number_of_parameters;
     const Draws *draws;
     Stream *streams; /* the random stream of each environment */
     uint8_t *ended; /* which environments start an episode instead of taking a step */
@@ -111,12 +113,20 @@ typedef struct {
 
 void play_open(const Turn *turn, PlayScratch *scratch);
 
-/* All three handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
- * are reset or stepped, the second afterwards where they were reset, the third at last. */
+/* Some environments of a run. */
+typedef struct {
+    size_t count;
+    uint32_t places[PROGRAM_WIDTH];
+} Listed;
+
+/* Lists the environments of a run whose episodes have ended: they start the next one instead of a step. */
+void play_list_ended(const Play *play, size_t begin, size_t count, Listed *ended);
+
+/* Both handle a run of at most PROGRAM_WIDTH environments, before and after their instances are reset
+ * or stepped. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
-void play_start_after_ended(const Turn *turn, size_t begin, size_t count);
 void play_conclude(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
-                PlayScratch *scratch, Verdict *verdict);
+                   const Listed *starting, PlayScratch *scratch, Verdict *verdict);
 
 /* Stores the observations and infos of environments outside of a step or after a start, at most
  * PROGRAM_WIDTH of them. */

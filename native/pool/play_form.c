@@ -67,10 +67,10 @@ static Row stored_row(Reader *reader, PlayForm *p, size_t arrays, const int64_t 
         return (Row){.data = NULL};
     }
     const size_t size = sizes[type];
-    if (p->stored_sizes[array] != 0 && p->stored_sizes[array] != elements * size) {
+    if (p->play.array_sizes[array] != 0 && p->play.array_sizes[array] != elements * size) {
         reader_refuse(reader, "elements of an array differ in type");
     }
-    p->stored_sizes[array] = elements * size;
+    p->play.array_sizes[array] = elements * size;
     return (Row){.array = array,
                  .offset = element * size,
                  .size = size,
@@ -197,6 +197,11 @@ void play_settle(PlayForm *p, const Settings *s, double *kept, uint8_t *ended) {
     play->number_of_outputs = s->outputs->count;
     play->kept_rows = kept;
     play->ended = ended;
+    play->number_of_arrays = play->number_of_seen + STEP_ARRAYS;
+    p->pool_observes = play->number_of_seen == 1 && play->array_sizes[0] == 0;
+    if (p->pool_observes) {
+        play->array_sizes[0] = s->num_observed * sizeof(float);
+    }
 }
 
 void play_drop(PlayForm *p) {

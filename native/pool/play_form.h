@@ -14,12 +14,11 @@ typedef struct {
     char *form;         /* a copy of it, which the play points to */
     RowCopy *before_inputs, *before_conclusion;
     RowStart *starts, *unstepped;
-    size_t stored_sizes[MOST_ARRAYS]; /* bytes of one environment, where programs store in an array */
+    bool pool_observes; /* whether the pool itself fills the observations, instead of a program */
 } PlayForm;
 
 /* Reads the form of a play, which names rows by their numbers among these. The caller has set the
- * draws, if there are any. Returns what is wrong, or NULL. The caller
- * must drop the play in any case. */
+ * draws, if there are any. Returns what is wrong, or NULL. The caller must drop the play in any case. */
 const char *play_take(PlayForm *p, const Settings *settings, const void *form, size_t size,
                       const Row *rows, size_t number_of_rows);
 /* Lets a play use the outputs and statuses of a pool, and memory of its owner: the outputs before a

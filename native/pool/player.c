@@ -20,9 +20,9 @@ size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     return troubled;
 }
 
-size_t pool_play_before(Pool *pool, const Call *call) {
+void pool_play_before(Pool *pool, const Call *call) {
     Task task = {.pool = pool, .call = call, .operation = BEFORE};
-    return schedule_run(&task, pool->settings.count);
+    schedule_run(&task, pool->settings.count);
 }
 
 size_t pool_play_after(Pool *pool, const Call *call, Ends *ends) {
@@ -36,26 +36,30 @@ size_t pool_play_after(Pool *pool, const Call *call, Ends *ends) {
 /* Stores the observations of all, as the program makes them. */
 static Verdict observe_all(const Pool *pool, const Turn *turn) {
     const size_t end = pool->settings.count;
-    PlayScratch registers;
+    PlayScratch programs;
     Verdict verdict = {.ended = 0};
 
-    play_open(turn, &registers);
+    play_open(turn, &programs);
     for (size_t first = 0; first < end; first += RUN) {
-        play_observe(turn, first, length_of_run(first, end), &registers, &verdict);
+        play_observe(turn, first, length_of_run(first, end), &programs, &verdict);
     }
     return verdict;
 }
 
-size_t pool_start(Pool *pool, const Call *call, bool *outside) {
-    const size_t troubled = pool_reset(pool, call);
+size_t pool_start(Pool *pool, const Call *call, Ends *ends) {
+    const Play *play = call->turn->play;
+    size_t troubled = pool_reset(pool, call);
 
+    *ends = (Ends){.ended = 0};
     if (call->observations == NULL) {
         const Verdict verdict = observe_all(pool, call->turn);
-        *outside = verdict.outside;
-        return troubled + verdict.troubled;
-    }
-    if (call->mask.data != NULL) {
+        ends->outside = verdict.outside;
+        troubled += verdict.troubled;
+    } else {
         write_all_observations(pool, call->observations);
+    }
+    for (size_t i = 0; i < play->count; i++) {
+        ends->ended += play->ended[i];
     }
     return troubled;
 }

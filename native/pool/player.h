@@ -6,9 +6,9 @@
 #include "pool/play.h"
 #include "pool/pool.h"
 
-/* What became of the episodes in a step that plays. */
+/* What became of the episodes in a call that plays. */
 typedef struct {
-    size_t ended;   /* how many have ended */
+    size_t ended;   /* how many are at their ends */
     size_t started; /* how many of these were followed by another one in the same step */
     bool outside;   /* whether a hook looked up an index outside of a table */
 } Ends;
@@ -19,14 +19,13 @@ typedef struct {
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
  * turn before and after. Writes all observations. */
 size_t pool_play(Pool *pool, const Call *call, Ends *ends);
-/* The two parts of a play around steps that are done elsewhere. The first runs the programs that
- * come before, and draws the start values of the instances in the mask, which are to be reset. The
- * second takes the outputs and statuses for those of the step. The turn has no arrays for episodes
- * that start in it, and reads_kept is set: the step overwrites the outputs. */
-size_t pool_play_before(Pool *pool, const Call *call);
+/* The two parts of a play around steps that are done elsewhere. The first runs the program that comes
+ * before, and keeps the outputs; it fails nowhere. The second takes the outputs and statuses for those of
+ * the step. The turn has no arrays for episodes that start in it. */
+void pool_play_before(Pool *pool, const Call *call);
 size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
-/* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
- * and sets outside if a hook looked up an index outside of a table. */
-size_t pool_start(Pool *pool, const Call *call, bool *outside);
+/* Starts the episodes of the turn in the mask. Writes all observations, and tells how many episodes are
+ * at their ends now. */
+size_t pool_start(Pool *pool, const Call *call, Ends *ends);
 
 #endif

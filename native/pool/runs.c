@@ -209,10 +209,7 @@ static size_t do_one(Task *task, size_t index, Scratch scratch) {
         return conclude_step(task, index, instance_step(pool, me, scratch), scratch.outputs);
     }
     if (task->operation != STEP) {
-        if (call->turn != NULL) {
-            play_draw(call->turn, index);
-        }
-        troubled = note_status(task, index, instance_reset(pool, me, call, scratch));
+        troubled = start_instance(task, index, scratch);
     }
     instance_copy_outputs(pool, me, scratch.outputs);
     return troubled;
@@ -470,19 +467,19 @@ static void replace_outputs(const Task *task, size_t begin, size_t count, const 
 static size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
     const Turn *turn = task->call->turn;
     Fresh fresh = {scratch.outputs, task->pool->settings.outputs->count, true};
+    Listed starting;
     size_t troubled;
 
+    play_list_ended(turn->play, run.begin, run.count, &starting);
     if (task->operation == AFTER) {
         troubled = take_over(task, run.begin, run.count, scratch, &fresh.fits_floats);
     } else {
-        play_prepare(turn, run.begin, run.count, run.registers);
+        play_prepare(turn, run.begin, run.count, run.scratch);
         troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
         replace_outputs(task, run.begin, run.count, scratch.outputs);
-        if (task->operation == PLAY) {
-            play_start_after_ended(turn, run.begin, run.count);
-        }
+        play_start_episodes(turn, starting.places, starting.count);
     }
-    play_conclude(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
+    play_conclude(turn, run.begin, run.count, &fresh, &starting, run.scratch, run.verdict);
     return troubled;
 }
 
@@ -496,13 +493,13 @@ size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch) {
 
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
     const Turn *turn = task->call->turn;
-    PlayScratch registers;
+    PlayScratch programs;
     Verdict verdict = {.ended = 0};
     size_t troubled = 0, started = 0;
 
-    play_open(turn, &registers);
+    play_open(turn, &programs);
     for (size_t first = begin; first < end; first += RUN) {
-        const PlayedRun run = {first, length_of_run(first, end), &registers, &verdict};
+        const PlayedRun run = {first, length_of_run(first, end), &programs, &verdict};
         troubled += run_turn(task, run, scratch);
         if (turn->started != NULL) {
             troubled += starts_after_ends(task, run, scratch, &started);
@@ -519,11 +516,11 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
 size_t run_before(Task *task, size_t begin, size_t end) {
     const Turn *turn = task->call->turn;
     const Play *play = turn->play;
-    PlayScratch registers;
+    PlayScratch programs;
 
-    play_open(turn, &registers);
+    play_open(turn, &programs);
     for (size_t first = begin; first < end; first += RUN) {
-        play_prepare(turn, first, length_of_run(first, end), &registers);
+        play_prepare(turn, first, length_of_run(first, end), &programs);
         if (!play->reads_kept) {
             play_keep_outputs(play, 0, play->number_of_outputs, first, length_of_run(first, end));
         }

@@ -27,9 +27,6 @@ enum {
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 
-    if (task->operation == BEFORE) { /* the caller knows what to do */
-        return end - begin;
-    }
     for (size_t i = begin; i < end; i++) {
         const size_t index = task->listed ? task->pool->chosen[i] : i;
         instance_refuse(&task->pool->instances[index], "out of memory");
@@ -55,9 +52,6 @@ static size_t most_values(const Task *task) {
 static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
     if (task->listed) {
         return run_listed(task, begin, end, scratch);
-    }
-    if (task->operation == BEFORE) {
-        return run_before(task, begin, end);
     }
     return task->operation == PLAY || task->operation == AFTER
                ? run_play(task, begin, end, scratch)
@@ -87,7 +81,8 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
 /* Works on a chunk, on a thread that is inside the pool. */
 static void work(Task *task, size_t begin, size_t end) {
     const uint64_t began = task->measured ? clock_now() : 0;
-    const size_t troubled = work_with_memory(task, begin, end);
+    const size_t troubled = task->operation == BEFORE ? run_before(task, begin, end)
+                                                      : work_with_memory(task, begin, end);
 
     if (troubled > 0) {
         atomic_add(&task->troubled, troubled);

@@ -23,13 +23,14 @@ static bool has_finite_observation(const Task *task, size_t index) {
     return finite;
 }
 
-/* Returns whether the environment is in trouble. */
-static bool reset_drawn(Task *task, size_t index, Scratch scratch) {
+size_t start_instance(Task *task, size_t index, Scratch scratch) {
     Pool *pool = task->pool;
+    const Call *call = task->call;
 
-    play_draw(task->call->turn, index);
-    return note_status(task, index,
-                       instance_reset(pool, &pool->instances[index], task->call, scratch)) > 0;
+    if (call->turn != NULL) {
+        play_draw(call->turn, index);
+    }
+    return note_status(task, index, instance_reset(pool, &pool->instances[index], call, scratch));
 }
 
 /* Returns whether the observation of an episode that starts is finite. */
@@ -46,7 +47,7 @@ size_t start_episodes(Task *task, const uint32_t *starting, size_t count, Scratc
     size_t number = 0;
 
     for (size_t j = 0; j < count; j++) {
-        troubled[j] = reset_drawn(task, starting[j], scratch);
+        troubled[j] = start_instance(task, starting[j], scratch) > 0;
     }
     play_start_episodes(task->call->turn, starting, count);
     for (size_t j = 0; j < count; j++) {
@@ -74,32 +75,30 @@ static void keep_last(const Task *task, size_t index) {
     }
 }
 
-/* Lists the environments of a run whose next episodes start, and notes that they do. */
-static size_t list_starting(const Task *task, const PlayedRun *run, uint32_t *starting) {
-    size_t count = 0;
-
+/* Lists the environments of a run whose next episodes start at once, and notes that they do. */
+static void list_restarting(const Task *task, const PlayedRun *run, Listed *starting) {
+    starting->count = 0;
     for (size_t index = run->begin; index < run->begin + run->count; index++) {
         const bool starts = has_ended_well(task, run, index);
         task->call->turn->started[index] = starts;
         if (starts) {
-            starting[count++] = (uint32_t)index;
+            starting->places[starting->count++] = (uint32_t)index;
         }
     }
-    return count;
 }
 
 size_t starts_after_ends(Task *task, PlayedRun run, Scratch scratch, size_t *started) {
     const Turn *turn = task->call->turn;
-    uint32_t starting[RUN];
-    const size_t count = list_starting(task, &run, starting);
+    Listed starting;
 
-    for (size_t j = 0; j < count; j++) {
-        keep_last(task, starting[j]);
+    list_restarting(task, &run, &starting);
+    for (size_t j = 0; j < starting.count; j++) {
+        keep_last(task, starting.places[j]);
     }
-    const size_t troubled = start_episodes(task, starting, count, scratch);
-    for (size_t j = 0; j < count; j++) {
-        play_observe(turn, starting[j], 1, run.registers, run.verdict);
+    const size_t troubled = start_episodes(task, starting.places, starting.count, scratch);
+    for (size_t j = 0; j < starting.count; j++) {
+        play_observe(turn, starting.places[j], 1, run.scratch, run.verdict);
     }
-    *started += count;
+    *started += starting.count;
     return troubled;
 }

@@ -17,8 +17,8 @@ typedef struct {
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */
     Atomic ended;                         /* episodes that have ended, when playing */
-    Atomic outside;                       /* threads that saw an index outside of a table */
     Atomic started;                       /* those of them whose next episode has started */
+    Atomic outside;                       /* threads that saw an index outside of a table */
     Atomic time;                          /* total ns of all threads, if measured */
 } Task;
 

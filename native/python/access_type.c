@@ -1,13 +1,10 @@
 /* The type Access: a list of variables. */
 
-#include <stdlib.h>
-#include <string.h>
-
 #include "python/python.h"
 
 PyTypeObject *access_type;
 
-bool is_access(const PyPool *self, PyObject *object) {
+bool require_access(const PyPool *self, PyObject *object) {
     if (!PyObject_TypeCheck(object, access_type) ||
         ((PyAccess *)object)->access.fmi != self->pool.settings.fmi) {
         PyErr_SetString(PyExc_TypeError, "expected an Access of this FMI version");
@@ -16,32 +13,26 @@ bool is_access(const PyPool *self, PyObject *object) {
     return true;
 }
 
-/* The form may lie at any address. */
-static const char *take_form(const char *form, Py_ssize_t size, Access *access) {
-    char *copy = malloc((size_t)size + 1);
-
-    if (copy == NULL) {
-        return "out of memory";
-    }
-    memcpy(copy, form, (size_t)size);
-    Reader reader = {copy, copy + size, NULL};
+/* The memory of bytes is aligned. */
+static const char *take_form(PyObject *form, Access *access) {
+    const char *bytes = PyBytes_AsString(form);
+    Reader reader = {bytes, bytes + PyBytes_Size(form), NULL};
     const Fmi *fmi = read_fmi(&reader);
+
     read_access(&reader, fmi, access);
-    free(copy);
     return reader.fault;
 }
 
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
-    const char *form;
-    Py_ssize_t size;
+    PyObject *form;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "y#", &form, &size)) {
+    if (!PyArg_ParseTuple(args, "S", &form)) {
         return NULL;
     }
     PyAccess *self = (PyAccess *)allocate(type, 0);
-    const char *fault = self == NULL ? NULL : take_form(form, size, &self->access);
+    const char *fault = self == NULL ? NULL : take_form(form, &self->access);
     if (fault != NULL) {
         Py_DECREF(self);
         PyErr_SetString(PyExc_ValueError, fault);

@@ -74,11 +74,10 @@ static void refuse_shape(const char *name, const Py_buffer *buffer, int dimensio
     PyErr_Format(PyExc_ValueError, "%s must have the shape %s, not %s", name, expected, actual);
 }
 
-Item item_of(int letter, size_t size) {
+Item item_of(const Py_buffer *buffer) {
     Item item = 0;
 
-    while (item < ITEMS && ((size_t)types[item].size != size ||
-                            strchr(types[item].formats, letter) == NULL)) {
+    while (item < ITEMS && !has_type(buffer, &types[item])) {
         item++;
     }
     return item;

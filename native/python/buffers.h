@@ -39,9 +39,8 @@ bool take_vector(PyObject *object, Py_buffer *buffer, Use use, const char *name,
 bool take_matrix(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
                  Py_ssize_t rows, Py_ssize_t columns);
 
-/* The type of items with this letter of the module struct and so many bytes, or ITEMS if there is
- * none. */
-Item item_of(int letter, size_t size);
+/* The type of the items of a buffer with a format, or ITEMS if it is another one. */
+Item item_of(const Py_buffer *buffer);
 
 /* Whether a buffer is such an array; otherwise sets an exception whose text begins with the name. The
  * shape has as many lengths as dimensions says. */

@@ -1,12 +1,10 @@
 /* The extension module fmugym._native. See fmugym/_native.pyi. */
 
-#include <string.h>
-
 #include "python/programs.h"
 
 #include "pool/threads.h"
 
-static PyObject *tuple_of(const char *const *texts, Py_ssize_t count) {
+static PyObject *names_of(const char *const *texts, Py_ssize_t count) {
     PyObject *names = PyTuple_New(count);
 
     for (Py_ssize_t i = 0; names != NULL && i < count; i++) {
@@ -16,18 +14,6 @@ static PyObject *tuple_of(const char *const *texts, Py_ssize_t count) {
         }
     }
     return names;
-}
-
-static PyObject *operations(PyObject *module, PyObject *unused) {
-    (void)module;
-    (void)unused;
-    return tuple_of(operation_names, NUMBER_OF_OPERATIONS);
-}
-
-static PyObject *distributions(PyObject *module, PyObject *unused) {
-    (void)module;
-    (void)unused;
-    return tuple_of(kind_names, NUMBER_OF_KINDS);
 }
 
 static PyObject *statistics(PyObject *module, PyObject *unused) {
@@ -48,9 +34,7 @@ static PyObject *initializations(PyObject *module, PyObject *unused) {
 }
 
 static PyMethodDef functions[] = {
-    {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
-    {"distributions", distributions, METH_NOARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},
@@ -72,6 +56,21 @@ static bool add_type(PyObject *module, PyTypeObject **type, PyType_Spec *spec) {
     return *type != NULL && PyModule_AddType(module, *type) == 0;
 }
 
+static bool add_names(PyObject *module, const char *name, const char *const *texts,
+                      Py_ssize_t count) {
+    PyObject *names = names_of(texts, count);
+    const bool added = PyModule_AddObjectRef(module, name, names) == 0; /* not if it is NULL */
+
+    Py_XDECREF(names);
+    return added;
+}
+
+static bool add_constants(PyObject *module) {
+    return add_names(module, "OPERATIONS", operation_names, NUMBER_OF_OPERATIONS) &&
+           add_names(module, "DISTRIBUTIONS", kind_names, NUMBER_OF_KINDS) &&
+           PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) == 0;
+}
+
 PyMODINIT_FUNC PyInit__native(void) {
     static PyTypeObject *pool_type;
     PyObject *module = PyModule_Create(&definition);
@@ -82,8 +81,7 @@ PyMODINIT_FUNC PyInit__native(void) {
     pool_prepare_process();
     if (!add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
-        !add_type(module, &pool_type, &pool_spec) ||
-        PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {
+        !add_type(module, &pool_type, &pool_spec) || !add_constants(module)) {
         Py_DECREF(module);
         return NULL;
     }

@@ -5,7 +5,8 @@
 #include "pool/inside.h"
 #include "python/python.h"
 
-PyObject *find_object(const char *module_name, const char *name) {
+/* A new reference to an object of a module, or NULL with an exception. */
+static PyObject *find_object(const char *module_name, const char *name) {
     PyObject *module = PyImport_ImportModule(module_name);
     PyObject *found = module == NULL ? NULL : PyObject_GetAttrString(module, name);
 
@@ -23,7 +24,7 @@ static void raise_closed(void) {
     }
 }
 
-bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
+bool require_arguments(Py_ssize_t given, Py_ssize_t expected) {
     if (given != expected) {
         PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", expected, given);
     }
@@ -83,8 +84,8 @@ bool report_messages(PyPool *self) {
 
 /* Getting the GIL back may take milliseconds if other Python threads are busy. So very short
  * work keeps the GIL. */
-static bool is_short(const PyPool *self, int length) {
-    return length != NEVER_SHORT && pool_is_quick(&self->pool, length);
+static bool is_short(const PyPool *self, int operation) {
+    return operation != NO_OPERATION && pool_is_quick(&self->pool, operation);
 }
 
 bool explain_entry(Entry entry) {
@@ -129,11 +130,11 @@ static void work_and_leave(PyPool *self, Work *work, void *context, Signals *sig
     pool_leave(&self->pool);
 }
 
-bool perform(PyPool *self, int length, Work *work, void *context) {
+bool perform(PyPool *self, int operation, Work *work, void *context) {
     Entry entry = pool_try_enter(&self->pool);
     Signals signals = {0};
 
-    if (entry == ENTRY_ENTERED && is_short(self, length)) {
+    if (entry == ENTRY_ENTERED && is_short(self, operation)) {
         work_and_leave(self, work, context, &signals);
     } else if (entry == ENTRY_ENTERED || entry == ENTRY_BUSY) {
         signals.released = PyEval_SaveThread();

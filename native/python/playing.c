@@ -38,7 +38,7 @@ static void replace_reference(PyObject **place, PyObject *object) {
 /* Preparing */
 
 static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObject *values) {
-    if (!is_access(self, start)) {
+    if (!require_access(self, start)) {
         return false;
     }
     Py_INCREF(start);
@@ -48,7 +48,7 @@ static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObjec
                        (Py_ssize_t)self->pool.settings.count);
 }
 
-static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject *states) {
+static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject *streams) {
     const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
 
     if (!PyObject_TypeCheck(draws, draws_type)) {
@@ -57,7 +57,7 @@ static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject
     }
     playing->draws = Py_NewRef(draws);
     playing->form.play.draws = &((PyDraws *)draws)->draws;
-    return take_matrix(states, &playing->buffers[STATES], WRITTEN, "states", ITEM_UINT64, n,
+    return take_matrix(streams, &playing->buffers[STREAMS], WRITTEN, "streams", ITEM_UINT64, n,
                        STREAM_NUMBERS);
 }
 
@@ -65,34 +65,32 @@ static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject
 typedef struct {
     const char *form;
     Py_ssize_t size;
-    PyObject *rows, *start, *start_values, *shape, *current, *previous, *draws, *states;
+    PyObject *rows, *start, *start_values, *current, *previous, *draws, *streams;
     PyObject *ended, *kept, *results;
-    int letter;
 } Parts;
 
 static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
-    static char *names[] = {"form",    "rows",     "start", "start_values", "shape",
-                            "letter",  "current",  "previous", "draws",     "states",
-                            "ended",   "kept",     "results", NULL};
+    static char *names[] = {"form",     "rows",  "start",   "start_values", "current", "previous",
+                            "draws",    "streams", "ended", "kept",         "results", NULL};
 
-    return PyArg_ParseTupleAndKeywords(
-        args, kwargs, "$y#O!OOO!COOOOOOO:prepare_play", names, &p->form, &p->size, &PyTuple_Type,
-        &p->rows, &p->start, &p->start_values, &PyTuple_Type, &p->shape, &p->letter, &p->current,
-        &p->previous, &p->draws, &p->states, &p->ended, &p->kept, &p->results);
+    return PyArg_ParseTupleAndKeywords(args, kwargs, "$y#O!OOOOOOOOO:prepare_play", names, &p->form,
+                                       &p->size, &PyTuple_Type, &p->rows, &p->start,
+                                       &p->start_values, &p->current, &p->previous, &p->draws,
+                                       &p->streams, &p->ended, &p->kept, &p->results);
 }
 
 static bool take_form(PyPool *self, Playing *playing, const Parts *p) {
     const Settings *s = &self->pool.settings;
     Play *play = &playing->form.play;
+    const size_t parameters = ((PyAccess *)playing->start)->access.count;
 
     play->start_values = playing->buffers[STARTS].buf;
-    play->number_of_parameters = ((PyAccess *)playing->start)->access.count;
     if (!take_rows(p->rows, (Py_ssize_t)s->count, &playing->rows)) {
         return false;
     }
     const char *fault = play_take(&playing->form, s, p->form, (size_t)p->size, playing->rows.rows,
                                   playing->rows.count);
-    if (fault == NULL && !draws_fit(play->draws, play->number_of_parameters)) {
+    if (fault == NULL && !draws_fit(play->draws, parameters)) {
         fault = "a draw is for no start value";
     }
     if (fault != NULL) {
@@ -101,51 +99,30 @@ static bool take_form(PyPool *self, Playing *playing, const Parts *p) {
     return fault == NULL;
 }
 
-static bool take_shape(PyPool *self, Playing *playing, PyObject *shape) {
-    const Py_ssize_t dimensions = PyTuple_Size(shape);
-    size_t elements = dimensions > MOST_DIMENSIONS ? SIZE_MAX : 1;
-
-    playing->action_dimensions = 1 + (int)dimensions;
-    playing->action_shape[0] = (Py_ssize_t)self->pool.settings.count;
-    for (Py_ssize_t i = 0; i < dimensions && elements <= UINT16_MAX; i++) {
-        const size_t length = PyLong_AsSize_t(PyTuple_GetItem(shape, i));
-        playing->action_shape[1 + i] = (Py_ssize_t)length;
-        elements = length > UINT16_MAX ? SIZE_MAX : elements * length;
-    }
-    if (!PyErr_Occurred() && elements != playing->form.play.actions.elements) {
-        PyErr_SetString(PyExc_ValueError, "an action has another number of elements");
-    }
-    return !PyErr_Occurred();
-}
-
-static bool take_kept_actions(PyPool *self, Playing *playing, PyObject *object, int number,
-                              char **actions) {
-    Py_buffer *buffer = &playing->buffers[number];
-    const size_t count = self->pool.settings.count * playing->form.play.actions.elements;
-
-    if (!take_vector(object, buffer, WRITTEN, "actions to keep", playing->action_item,
-                     (Py_ssize_t)count)) {
-        return false;
-    }
-    *actions = buffer->buf;
-    return true;
-}
-
-/* The memory is that for the actions of this step, and of the one before. */
+/* The actions of this step, of any type and with the environments on the first axis; those before alike. */
 static bool take_actions(PyPool *self, Playing *playing, const Parts *p) {
     Actions *a = &playing->form.play.actions;
+    Py_buffer *current = &playing->buffers[CURRENT], *previous = &playing->buffers[PREVIOUS];
+    const size_t count = self->pool.settings.count;
+    const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | PyBUF_WRITABLE;
 
-    playing->action_item = item_of(p->letter, a->size);
-    if (playing->action_item == ITEMS) {
-        PyErr_Format(PyExc_ValueError, "actions have no type '%c' of %zu bytes", p->letter, a->size);
+    if (PyObject_GetBuffer(p->current, current, flags) < 0 ||
+        PyObject_GetBuffer(p->previous, previous, flags) < 0) {
         return false;
     }
-    return take_shape(self, playing, p->shape) &&
-           take_kept_actions(self, playing, p->current, CURRENT, &a->current) &&
-           take_kept_actions(self, playing, p->previous, PREVIOUS, &a->previous);
+    playing->action_item = item_of(current);
+    if (playing->action_item == ITEMS || current->ndim == 0 ||
+        current->shape[0] != (Py_ssize_t)count || (size_t)current->itemsize != a->size ||
+        (size_t)current->len != count * a->elements * a->size) {
+        PyErr_SetString(PyExc_ValueError, "the memory for actions has another type or shape");
+        return false;
+    }
+    a->current = current->buf;
+    a->previous = previous->buf;
+    return buffer_fits(previous, WRITTEN, "previous actions", playing->action_item, current->ndim,
+                       current->shape);
 }
 
-/* Nobody asks for done later if it is None. */
 static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
     const Settings *s = &self->pool.settings;
     const Py_ssize_t n = (Py_ssize_t)s->count;
@@ -157,12 +134,8 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
         return false;
     }
     play_settle(&playing->form, s, b[KEPT].buf, b[ENDED].buf);
-    playing->form.play.streams = b[STATES].buf;
+    playing->form.play.streams = b[STREAMS].buf;
     return true;
-}
-
-bool pool_observes(const Playing *playing) {
-    return playing->form.play.number_of_seen == 1 && playing->form.stored_sizes[0] == 0;
 }
 
 static bool results_fit(const PyPool *self, const Playing *playing) {
@@ -183,20 +156,8 @@ static bool results_fit(const PyPool *self, const Playing *playing) {
     return fit;
 }
 
-/* Notes how large the arrays must be that programs or the pool fill. */
-static void measure_arrays(const PyPool *self, Playing *playing) {
-    Play *play = &playing->form.play;
-
-    memcpy(play->array_sizes, playing->form.stored_sizes, sizeof play->array_sizes);
-    if (pool_observes(playing)) {
-        play->array_sizes[0] = self->pool.settings.num_observed * sizeof(float);
-    }
-    play->number_of_arrays = play->number_of_seen + STEP_ARRAYS;
-}
-
 static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
     playing->results = results_take(parts);
-    measure_arrays(self, playing);
     if (playing->results != NULL && !results_fit(self, playing)) {
         PyErr_SetString(PyExc_ValueError, "the arrays of results do not fit the pool");
         return false;
@@ -209,7 +170,7 @@ static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwarg
     Parts p;
 
     return parse(args, kwargs, &p) && take_starts(self, playing, p.start, p.start_values) &&
-           take_draws(self, playing, p.draws, p.states) && take_form(self, playing, &p) &&
+           take_draws(self, playing, p.draws, p.streams) && take_form(self, playing, &p) &&
            take_actions(self, playing, &p) && take_arrays(self, playing, &p) &&
            take_results(self, playing, p.results);
 }

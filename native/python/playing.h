@@ -1,4 +1,4 @@
-/* What is prepared for playing, and a turn of it. For the files that prepare it and that play. */
+/* What is prepared for playing. For the files that prepare it and that play. */
 
 #ifndef FMUGYM_PLAYING_H
 #define FMUGYM_PLAYING_H
@@ -10,9 +10,9 @@
 
 enum {
     STARTS,
-    STATES,
+    STREAMS,
     ENDED,
-    CURRENT,
+    CURRENT, /* the actions of a step, and of the one before */
     PREVIOUS,
     KEPT,
     PLAY_BUFFERS
@@ -24,8 +24,6 @@ typedef struct {
     PyRows rows;
     Py_buffer buffers[PLAY_BUFFERS];
     Item action_item;
-    int action_dimensions;
-    Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;
     Results *results;
@@ -33,33 +31,5 @@ typedef struct {
 
 /* Of a capsule that prepare_play has made. */
 Playing *playing_of(PyObject *capsule);
-
-/* Whether the pool itself fills the observations, instead of a program. */
-bool pool_observes(const Playing *playing);
-
-/* One call that plays: */
-
-typedef struct {
-    Py_buffer actions;
-    Turn turn;
-    Call call;
-    int64_t number; /* the action of the only environment, if it is an integer */
-    bool bad_action;
-    size_t troubled;
-    Ends ends;
-} PyTurn;
-
-/* Takes an array of actions, or the action of the only environment: an array, or an integer. Those of
- * another type or shape come back as an exception; the caller then converts them. */
-bool take_actions_of_turn(const Playing *playing, PyObject *actions, PyTurn *t);
-
-/* Lets the turn and its call refer to what was prepared and to the actions, if there are any. */
-void settle_turn(PyPool *self, const Playing *playing, PyTurn *t);
-
-/* Whether a hook looked up an index outside of a table, which is an exception. */
-bool is_outside(const PyTurn *t);
-
-/* Returns false with an exception if nothing is prepared. */
-bool is_prepared(const PyPool *self);
 
 #endif

@@ -33,13 +33,14 @@ bool take_pool_arguments(PyPool *self, PyObject *args) {
     const char *form;
     Py_ssize_t size;
 
-    self->arguments = Py_NewRef(args);
     if (!PyArg_ParseTuple(args, "y#(OOOOO)O:Pool", &form, &size, &arrays[INPUTS], &arrays[OUTPUTS],
                           &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
                           &self->callback) ||
         !take_form(self, form, size) || !take_arrays(self, arrays)) {
+        self->callback = NULL;
         return false;
     }
+    Py_INCREF(self->callback);
     s->output_values = self->buffers[OUTPUTS].buf;
     s->status = self->buffers[STATUS].buf;
     s->health = self->buffers[HEALTH].buf;

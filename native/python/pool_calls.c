@@ -17,7 +17,7 @@ static Matrix matrix_of(const Py_buffer *buffer) {
     return (Matrix){buffer->buf, buffer->strides[0], buffer->strides[1]};
 }
 
-static bool view_mask(PyPool *self, PyObject *object, PyCall *c) {
+static bool take_mask(PyPool *self, PyObject *object, PyCall *c) {
     if (object == Py_None) {
         return true;
     }
@@ -29,8 +29,8 @@ static bool view_mask(PyPool *self, PyObject *object, PyCall *c) {
     return true;
 }
 
-static bool view_start(PyPool *self, PyObject *access, PyObject *values, PyCall *c) {
-    if (!is_access(self, access)) {
+static bool take_start(PyPool *self, PyObject *access, PyObject *values, PyCall *c) {
+    if (!require_access(self, access)) {
         return false;
     }
     c->call.start = &((PyAccess *)access)->access;
@@ -51,7 +51,7 @@ static void do_call(PyPool *self, bool alone, void *context) {
                                        : pool_reset(&self->pool, &c->call);
 }
 
-static PyObject *finish(PyPool *self, PyCall *c, bool good) {
+static PyObject *make_call(PyPool *self, PyCall *c, bool good) {
     const bool done = good && perform(self, c->operation, do_call, c);
 
     release_buffer(&c->mask);
@@ -63,16 +63,16 @@ PyObject *py_step(PyObject *object, PyObject *mask) {
     PyPool *self = (PyPool *)object;
     PyCall c = {.operation = STEP, .call = {.observations = self->buffers[OBSERVATIONS].buf}};
 
-    return finish(self, &c, view_mask(self, mask, &c));
+    return make_call(self, &c, take_mask(self, mask, &c));
 }
 
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
     PyCall c = {.operation = RESET};
 
-    return finish(self, &c,
-                  has_arguments(nargs, 3) && view_start(self, args[0], args[1], &c) &&
-                      view_mask(self, args[2], &c));
+    return make_call(self, &c,
+                  require_arguments(nargs, 3) && take_start(self, args[0], args[1], &c) &&
+                      take_mask(self, args[2], &c));
 }
 
 static void do_count_steps(PyPool *self, bool alone, void *context) {
@@ -83,7 +83,7 @@ static void do_count_steps(PyPool *self, bool alone, void *context) {
 
 PyObject *py_count_steps(PyObject *object, PyObject *unused) {
     (void)unused;
-    return perform((PyPool *)object, NEVER_SHORT, do_count_steps, NULL) ? Py_NewRef(Py_None) : NULL;
+    return perform((PyPool *)object, NO_OPERATION, do_count_steps, NULL) ? Py_NewRef(Py_None) : NULL;
 }
 
 /* What is asked for besides steps and resets: see pool/requests.h. */
@@ -165,7 +165,7 @@ static PyObject *answer_of(const Asking *a) {
 
 static PyObject *ask(PyPool *self, Asking *a, PyObject *states) {
     if ((states != NULL && !take_states(states, a)) ||
-        !perform(self, NEVER_SHORT, do_ask, a) || !report_messages(self)) {
+        !perform(self, NO_OPERATION, do_ask, a) || !report_messages(self)) {
         return NULL;
     }
     return answer_of(a);
@@ -175,11 +175,9 @@ static PyObject *ask(PyPool *self, Asking *a, PyObject *states) {
 PyObject *py_ask(PyObject *object, PyObject *args) {
     Asking a = {.held = NULL};
     int request;
-    const char *form;
-    Py_ssize_t size;
-    PyObject *states = NULL;
+    PyObject *form, *states = NULL;
 
-    if (!PyArg_ParseTuple(args, "iy#|O:ask", &request, &form, &size, &states)) {
+    if (!PyArg_ParseTuple(args, "iS|O:ask", &request, &form, &states)) {
         return NULL;
     }
     if (request < 0 || request >= REQUESTS) {
@@ -187,7 +185,8 @@ PyObject *py_ask(PyObject *object, PyObject *args) {
         return NULL;
     }
     a.request = (Request)request;
-    a.reader = (Reader){form, form + size, NULL};
+    const char *bytes = PyBytes_AsString(form);
+    a.reader = (Reader){bytes, bytes + PyBytes_Size(form), NULL};
     PyObject *result = ask((PyPool *)object, &a, states);
     free(a.writer.bytes);
     free(a.states);

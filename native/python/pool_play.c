@@ -4,17 +4,62 @@
 
 #include <string.h>
 
+/* One call that plays. */
+typedef struct {
+    PyObject *capsule; /* keeps what was prepared alive */
+    const Playing *playing;
+    Py_buffer actions;
+    int64_t number; /* the action of the only environment, if it is an integer */
+    Turn turn;
+    Call call;
+    bool bad_action;
+    size_t troubled;
+    Ends ends;
+} PyTurn;
+
+/* Lets a turn and its call refer to what was prepared. Returns false with an exception if nothing was. */
+static bool begin_turn(PyPool *self, PyTurn *t) {
+    const Py_buffer *inputs = &self->buffers[INPUTS];
+
+    if (self->playing == NULL) {
+        PyErr_SetString(PyExc_ValueError, "play was not prepared");
+        return false;
+    }
+    t->capsule = Py_NewRef(self->playing);
+    t->playing = playing_of(t->capsule);
+    const Play *play = &t->playing->form.play;
+    const Py_buffer *starts = &t->playing->buffers[STARTS];
+    t->turn.play = play;
+    t->call = (Call){
+        .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
+        .start = &((PyAccess *)t->playing->start)->access,
+        .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
+        .mask = {(const char *)play->ended, 1},
+        .turn = &t->turn,
+    };
+    return true;
+}
+
+static void end_turn(PyTurn *t) {
+    release_buffer(&t->actions);
+    Py_XDECREF(t->capsule);
+}
+
+/* Actions. Those of another type or shape come back as an exception; the caller then converts them. */
+
 static bool is_of_one(const Playing *playing) {
     return playing->results != NULL && results_are_of_one(playing->results);
 }
 
 static bool take_array(const Playing *playing, PyObject *actions, Py_buffer *b) {
+    const Py_buffer *kept = &playing->buffers[CURRENT];
+
     if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
         return false;
     }
-    const int first = is_of_one(playing) && b->ndim == playing->action_dimensions - 1;
-    return buffer_fits(b, IN_PLACE, "the actions", playing->action_item,
-                       playing->action_dimensions - first, playing->action_shape + first);
+    const int first = is_of_one(playing) && b->ndim == kept->ndim - 1;
+    return buffer_fits(b, IN_PLACE, "the actions", playing->action_item, kept->ndim - first,
+                       kept->shape + first);
 }
 
 static bool take_integer(PyObject *action, PyTurn *t) {
@@ -30,29 +75,35 @@ static bool take_integer(PyObject *action, PyTurn *t) {
     return true;
 }
 
-bool take_actions_of_turn(const Playing *playing, PyObject *actions, PyTurn *t) {
-    const bool is_discrete = playing->form.play.actions.check == ACTIONS_IN_RANGE;
+/* Takes an array of actions, or the action of the only environment: an array, or an integer. */
+static bool take_actions(PyObject *actions, PyTurn *t) {
+    const bool is_discrete = t->turn.play->actions.check == ACTIONS_IN_RANGE;
+    const bool good = is_discrete && is_of_one(t->playing) && !PySequence_Check(actions)
+                          ? take_integer(actions, t)
+                          : take_array(t->playing, actions, &t->actions);
 
-    return is_discrete && is_of_one(playing) && !PySequence_Check(actions)
-               ? take_integer(actions, t)
-               : take_array(playing, actions, &t->actions);
+    t->turn.actions = t->actions.buf;
+    return good;
 }
 
-void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
-    const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
-
-    t->turn = (Turn){
-        .play = &playing->form.play,
-        .actions = t->actions.buf,
-    };
-    t->call = (Call){
-        .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
-        .start = &((PyAccess *)playing->start)->access,
-        .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
-        .mask = {(const char *)playing->form.play.ended, 1},
-        .turn = &t->turn,
-    };
+static bool require_good_actions(bool are_bad) {
+    if (are_bad) {
+        PyErr_SetString(PyExc_ValueError, "an action is out of range or NaN");
+    }
+    return !are_bad;
 }
+
+/* Nothing but the check of the actions that every step begins with. */
+PyObject *py_check_actions(PyObject *object, PyObject *actions) {
+    PyTurn t = {.bad_action = false};
+    const bool good = begin_turn((PyPool *)object, &t) && take_actions(actions, &t) &&
+                      require_good_actions(play_has_bad_action(&t.turn));
+
+    end_turn(&t);
+    return good ? Py_NewRef(Py_None) : NULL;
+}
+
+/* Work inside of the pool */
 
 static void do_play(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
@@ -68,10 +119,9 @@ static void do_before(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
 
     t->call.alone = alone;
-    t->ends.outside = false;
     t->bad_action = play_has_bad_action(&t->turn);
     if (!t->bad_action) {
-        t->troubled = pool_play_before(&self->pool, &t->call);
+        pool_play_before(&self->pool, &t->call);
     }
 }
 
@@ -82,168 +132,141 @@ static void do_after(PyPool *self, bool alone, void *context) {
     t->troubled = pool_play_after(&self->pool, &t->call, &t->ends);
 }
 
-bool is_outside(const PyTurn *t) {
-    if (t->ends.outside) {
-        PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
-    }
-    return t->ends.outside;
+static void do_start(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+
+    t->call.alone = alone;
+    t->troubled = pool_start(&self->pool, &t->call, &t->ends);
 }
 
-/* Lets the step fill the arrays that it returns. */
-static void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+/* Returns false with an exception if the result cannot be used. */
+static bool play_turn(PyPool *self, int operation, Work *work, PyTurn *t) {
+    if (!perform(self, operation, work, t) || !require_good_actions(t->bad_action)) {
+        return false;
+    }
+    if (t->ends.outside) {
+        PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
+        return false;
+    }
+    return report_messages(self);
+}
+
+/* Lets a turn fill the arrays that it returns. */
+static void settle_results(const ResultArrays *arrays, PyTurn *t) {
     t->turn.arrays = arrays->memory;
-    if (pool_observes(playing)) {
+    if (t->playing->form.pool_observes) {
         t->call.observations = (float *)(void *)arrays->memory[0];
     }
 }
 
-/* Lets episodes start where others have ended before this step. */
-static void settle_starts(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
-    const Results *r = playing->results;
-    const Play *play = &playing->form.play;
-
-    t->turn.drawn = (double *)(void *)arrays->memory[results_place(r, DRAWN_ARRAY)];
-    memcpy(arrays->memory[results_place(r, MASK_ARRAY)], play->ended, play->count);
+static char *memory_of(const PyTurn *t, const ResultArrays *arrays, size_t other) {
+    return arrays->memory[results_place(t->playing->results, other)];
 }
 
-/* Lets them also start where others end in this step. */
-static void settle_starts_at_ends(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
-    t->turn.last = arrays->last_memory;
-    t->turn.started = (uint8_t *)arrays->memory[results_place(playing->results, MASK_ARRAY)];
+/* Lets episodes start where others have ended before this step, and at_ends also where others end in
+ * it. Those that another thread ends in between start with the values of earlier draws. */
+static void settle_starts(const ResultArrays *arrays, bool at_ends, PyTurn *t) {
+    const Play *play = t->turn.play;
+    char *mask = memory_of(t, arrays, MASK_ARRAY);
+
+    t->turn.drawn = (double *)(void *)memory_of(t, arrays, DRAWN_ARRAY);
+    memcpy(mask, play->ended, play->count);
+    if (at_ends) {
+        t->turn.last = arrays->last_memory;
+        t->turn.started = (uint8_t *)mask;
+    }
 }
 
-static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
+static PyObject *result_of(const PyTurn *t, const ResultArrays *arrays) {
     const bool at_ends = t->turn.started != NULL;
     const bool any_started = at_ends ? t->ends.started > 0 : t->turn.drawn != NULL;
 
-    return results_of_step(playing->results, arrays, t->troubled, t->ends.ended > t->ends.started,
-                           any_started, at_ends);
+    return results_of_step(t->playing->results, arrays, t->troubled,
+                           t->ends.ended > t->ends.started, any_started, at_ends);
 }
 
-static void raise_bad_action(void) {
-    PyErr_SetString(PyExc_ValueError, "an action is out of range");
-}
-
-static bool play_turn(PyPool *self, int operation, PyTurn *t) {
-    static Work *const works[OPERATIONS] = {
-        [PLAY] = do_play, [BEFORE] = do_before, [AFTER] = do_after};
-
-    if (!perform(self, operation, works[operation], t)) {
-        return false;
-    }
-    if (t->bad_action) {
-        raise_bad_action();
-        return false;
-    }
-    return !is_outside(t) && report_messages(self);
-}
-
-/* What comes before the FMUs' part fills nothing that it returns. */
-static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *actions) {
-    const Playing *playing = playing_of(capsule);
-    PyTurn t = {.bad_action = false};
-    bool done = false;
-
-    if (take_actions_of_turn(playing, actions, &t)) {
-        settle_turn(self, playing, &t);
-        done = play_turn(self, BEFORE, &t);
-    }
-    release_buffer(&t.actions);
-    return done ? Py_NewRef(Py_None) : NULL;
-}
-
-static bool provide(Results *results, bool starts, bool at_ends, ResultArrays *arrays) {
-    return results_provide_step(results, arrays) &&
-           (!starts || results_provide_starts(results, at_ends, arrays));
-}
-
-static void settle_step(PyPool *self, const Playing *playing, bool starts, bool at_ends,
-                        const ResultArrays *arrays, PyTurn *t) {
-    settle_turn(self, playing, t);
-    settle_results(playing, arrays, t);
-    if (starts) {
-        settle_starts(playing, arrays, t);
-    }
-    if (at_ends) {
-        settle_starts_at_ends(playing, arrays, t);
-    }
-}
-
-/* Reads where episodes have ended before it enters the pool. Those that another thread ends in between
- * start with the values of earlier draws. */
-static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *actions,
-                           bool at_ends) {
-    const Playing *playing = playing_of(capsule);
-    const Play *play = &playing->form.play;
+static PyObject *step_with(PyPool *self, int operation, Work *work, bool at_ends, PyTurn *t) {
+    const Play *play = t->turn.play;
+    Results *results = t->playing->results;
     const bool starts =
         operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
     ResultArrays arrays;
-    PyTurn t = {.bad_action = false};
     PyObject *result = NULL;
 
-    if (provide(playing->results, starts, at_ends, &arrays) &&
-        take_actions_of_turn(playing, actions, &t)) {
-        settle_step(self, playing, starts, at_ends, &arrays, &t);
-        result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
-    }
-    results_drop(playing->results, &arrays);
-    release_buffer(&t.actions);
-    return result;
-}
-
-bool is_prepared(const PyPool *self) {
-    if (self->playing == NULL) {
-        PyErr_SetString(PyExc_ValueError, "play was not prepared");
-    }
-    return self->playing != NULL;
-}
-
-/* Keeps what was prepared alive while it plays. */
-static PyObject *play_by(PyObject *object, int operation, PyObject *actions, bool at_ends) {
-    PyPool *self = (PyPool *)object;
-
-    if (!is_prepared(self)) {
-        return NULL;
-    }
-    PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = operation == BEFORE
-                           ? play_before_with(self, playing, actions)
-                           : play_with(self, operation, playing, actions, at_ends);
-    Py_DECREF(playing);
-    return result;
-}
-
-/* Nothing but the check of the actions that every step begins with. */
-PyObject *py_check_actions(PyObject *object, PyObject *actions) {
-    PyPool *self = (PyPool *)object;
-    PyTurn t = {.bad_action = false};
-
-    if (!is_prepared(self)) {
-        return NULL;
-    }
-    PyObject *capsule = Py_NewRef(self->playing);
-    const Playing *playing = playing_of(capsule);
-    bool good = take_actions_of_turn(playing, actions, &t);
-    if (good) {
-        settle_turn(self, playing, &t);
-        good = !play_has_bad_action(&t.turn);
-        if (!good) {
-            raise_bad_action();
+    if (results_provide_step(results, &arrays) &&
+        (!starts || results_provide_starts(results, at_ends, &arrays))) {
+        settle_results(&arrays, t);
+        if (starts) {
+            settle_starts(&arrays, at_ends, t);
         }
+        result = play_turn(self, operation, work, t) ? result_of(t, &arrays) : NULL;
     }
-    release_buffer(&t.actions);
-    Py_DECREF(capsule);
-    return good ? Py_NewRef(Py_None) : NULL;
+    results_drop(results, &arrays);
+    return result;
 }
+
+/* Methods */
 
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return has_arguments(nargs, 2) ? play_by(object, PLAY, args[0], args[1] == Py_True) : NULL;
+    PyPool *self = (PyPool *)object;
+    PyTurn t = {.bad_action = false};
+    const bool good =
+        require_arguments(nargs, 2) && begin_turn(self, &t) && take_actions(args[0], &t);
+    PyObject *result =
+        good ? step_with(self, PLAY, do_play, args[1] == Py_True, &t) : NULL;
+
+    end_turn(&t);
+    return result;
 }
 
+/* What comes before the FMUs' part fills nothing that it returns. */
 PyObject *py_play_before(PyObject *object, PyObject *actions) {
-    return play_by(object, BEFORE, actions, false);
+    PyPool *self = (PyPool *)object;
+    PyTurn t = {.bad_action = false};
+    const bool done = begin_turn(self, &t) && take_actions(actions, &t) &&
+                      play_turn(self, BEFORE, do_before, &t);
+
+    end_turn(&t);
+    return done ? Py_NewRef(Py_None) : NULL;
 }
 
-PyObject *py_play_after(PyObject *object, PyObject *actions) {
-    return play_by(object, AFTER, actions, false);
+PyObject *py_play_after(PyObject *object, PyObject *unused) {
+    PyPool *self = (PyPool *)object;
+    PyTurn t = {.bad_action = false};
+    PyObject *result = begin_turn(self, &t) ? step_with(self, AFTER, do_after, false, &t) : NULL;
+
+    (void)unused;
+    end_turn(&t);
+    return result;
+}
+
+/* The memory is provided first: that may run code that changes the caller's mask. */
+static PyObject *start_with(PyPool *self, PyObject *mask, PyTurn *t) {
+    Results *results = t->playing->results;
+    ResultArrays arrays;
+    PyObject *result = NULL;
+
+    if (results_provide_reset(results, &arrays)) {
+        if (!results_copy_mask(results, mask, &arrays)) {
+            result = Py_NewRef(Py_None);
+        } else {
+            settle_results(&arrays, t);
+            t->call.mask = (Mask){memory_of(t, &arrays, MASK_ARRAY), 1};
+            t->turn.drawn = (double *)(void *)memory_of(t, &arrays, DRAWN_ARRAY);
+            result = play_turn(self, RESET, do_start, t)
+                         ? results_of_reset(results, &arrays, t->troubled, t->ends.ended > 0)
+                         : NULL;
+        }
+    }
+    results_drop(results, &arrays);
+    return result;
+}
+
+PyObject *py_start(PyObject *object, PyObject *mask) {
+    PyPool *self = (PyPool *)object;
+    PyTurn t = {.bad_action = false};
+    PyObject *result = begin_turn(self, &t) ? start_with(self, mask, &t) : NULL;
+
+    end_turn(&t);
+    return result;
 }

@@ -1,7 +1,4 @@
-/* The type Pool: making and closing pools, and their methods. */
-
-#include <stdlib.h>
-#include <string.h>
+/* The type Pool: making, closing, and the table of its methods. */
 
 #include "python/python.h"
 
@@ -56,7 +53,7 @@ static void pool_dealloc(PyObject *object) {
     PyTypeObject *type = Py_TYPE(object);
     freefunc release_memory = (freefunc)PyType_GetSlot(type, Py_tp_free);
 
-    if (self->opened) {
+    if (self->needs_closing) {
         close_at_the_end(self);
     }
     for (int i = 0; i < BUFFERS; i++) {
@@ -64,7 +61,7 @@ static void pool_dealloc(PyObject *object) {
     }
     opening_drop(&self->opening);
     Py_XDECREF(self->playing);
-    Py_XDECREF(self->arguments);
+    Py_XDECREF(self->callback);
     release_memory(object);
     Py_DECREF(type);
 }
@@ -75,7 +72,7 @@ static bool open_pool(PyPool *self) {
     char error[8192];
     bool opened;
 
-    self->opened = true;
+    self->needs_closing = true;
     Py_BEGIN_ALLOW_THREADS opened = pool_open(&self->pool, &self->opening.settings, error,
                                                 sizeof error);
     Py_END_ALLOW_THREADS if (!report_messages(self)) {
@@ -110,7 +107,7 @@ static PyMethodDef methods[] = {
     FAST("play", py_play),
     {"check_actions", py_check_actions, METH_O, NULL},
     {"play_before", py_play_before, METH_O, NULL},
-    {"play_after", py_play_after, METH_O, NULL},
+    {"play_after", py_play_after, METH_NOARGS, NULL},
     {"start", py_start, METH_O, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"ask", py_ask, METH_VARARGS, NULL},

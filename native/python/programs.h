@@ -6,8 +6,6 @@
 #include "program/program_form.h"
 #include "python/python.h"
 
-enum { MOST_DIMENSIONS = 8 }; /* of an action */
-
 /* Rows of programs, which stay in use. */
 typedef struct {
     Py_buffer *buffers;
@@ -20,10 +18,7 @@ typedef struct {
 bool take_rows(PyObject *tuple, Py_ssize_t length, PyRows *rows);
 void release_rows(PyRows *rows);
 
-/* Functions of the module */
+/* A function of the module */
 PyObject *py_evaluate(PyObject *module, PyObject *args);
-PyObject *py_serve(PyObject *module, PyObject *args);
-PyObject *py_end_with(PyObject *module, PyObject *number);
-PyObject *py_stop_tracing(PyObject *module, PyObject *args);
 
 #endif

@@ -1,4 +1,4 @@
-/* Shared by the files that present the pool to Python. No other file includes Python.h. */
+/* Shared by the files that present the pool to Python. No file of another folder includes Python.h. */
 
 #ifndef FMUGYM_PYTHON_H
 #define FMUGYM_PYTHON_H
@@ -27,9 +27,8 @@ typedef struct {
 
 typedef struct {
     PyObject_HEAD Pool pool;
-    bool opened;         /* whether the pool may need closing */
+    bool needs_closing;
     Opening opening;
-    PyObject *arguments; /* keeps the arrays and the callback alive */
     PyObject *callback;
     Py_buffer buffers[BUFFERS];
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
@@ -39,26 +38,23 @@ extern PyTypeObject *access_type, *draws_type;
 extern PyType_Spec access_spec, draws_spec, pool_spec;
 
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
-bool is_access(const PyPool *self, PyObject *object);
-
-/* A new reference to an object of a module, or NULL with an exception. */
-PyObject *find_object(const char *module_name, const char *name);
+bool require_access(const PyPool *self, PyObject *object);
 
 PyObject *decode(const char *text);
 /* Takes the arguments of a new pool, all but the opening of it. Returns false with an exception. */
 bool take_pool_arguments(PyPool *self, PyObject *args);
-bool has_arguments(Py_ssize_t given, Py_ssize_t expected);
+bool require_arguments(Py_ssize_t given, Py_ssize_t expected);
 
 /* Calls. Work runs inside the pool, either with the GIL (alone) or without it. No thread waits
  * for the pool while it holds the GIL, because the thread inside may need the GIL. */
 
 typedef void Work(PyPool *self, bool alone, void *context);
 
-enum { NEVER_SHORT = -1 };
+enum { NO_OPERATION = -1 };
 
-/* Does some work. length is one of the operations of pool/pool.h, whose duration the pool knows, or
- * NEVER_SHORT. Returns false with an exception if the pool cannot be entered. */
-bool perform(PyPool *self, int length, Work *work, void *context);
+/* Does some work: one of the operations of pool/pool.h, whose duration the pool knows, or
+ * NO_OPERATION. Returns false with an exception if the pool cannot be entered. */
+bool perform(PyPool *self, int operation, Work *work, void *context);
 /* Sets the exception of an entry that was refused. Returns whether it was not. */
 bool explain_entry(Entry entry);
 
@@ -78,7 +74,12 @@ PyObject *py_start(PyObject *object, PyObject *mask);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_check_actions(PyObject *object, PyObject *actions);
 PyObject *py_play_before(PyObject *object, PyObject *actions);
-PyObject *py_play_after(PyObject *object, PyObject *actions);
+PyObject *py_play_after(PyObject *object, PyObject *unused);
 
+/* The functions of the module that make a process a worker */
+
+PyObject *py_serve(PyObject *module, PyObject *args);
+PyObject *py_end_with(PyObject *module, PyObject *number);
+PyObject *py_stop_tracing(PyObject *module, PyObject *args);
 
 #endif

@@ -165,7 +165,7 @@ static PyObject *other_of(const Results *r, const ResultArrays *a, size_t other)
     return Py_NewRef(a->arrays[results_place(r, other)]);
 }
 
-/* The rewards, or where episodes have ended; of a single environment a number. */
+/* Rewards, terminated or truncated: an array, or for a single environment a float or a bool. */
 static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t other) {
     if (!r->are_of_one) {
         return other_of(r, a, other);

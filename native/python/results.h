@@ -3,12 +3,11 @@
 #ifndef FMUGYM_RESULTS_H
 #define FMUGYM_RESULTS_H
 
-#include "program/program.h"
+#include "pool/play.h"
 #include "python/python.h"
 
-/* After the arrays of observations and infos come those that only a step has, then those that only
- * starts of episodes have. */
-enum { REWARDS_ARRAY, TERMINATED_ARRAY, TRUNCATED_ARRAY, STEP_ARRAYS };
+/* After the arrays of observations and infos come those that only a step has (pool/play.h), then those
+ * that only starts of episodes have. */
 enum { MASK_ARRAY = STEP_ARRAYS, DRAWN_ARRAY, OTHER_ARRAYS };
 enum { MOST_SEEN = MOST_ARRAYS - STEP_ARRAYS, RESULT_ARRAYS = MOST_SEEN + OTHER_ARRAYS };
 
@@ -40,8 +39,8 @@ size_t results_size(const Results *results, size_t array);
  * them in any case. */
 bool results_provide_step(Results *results, ResultArrays *arrays);
 bool results_provide_reset(Results *results, ResultArrays *arrays);
-/* Provides, after results_provide_step, what it takes besides if episodes start; and if they do so
- * where others end, for which arrays are blank. */
+/* After results_provide_step: provides the mask and the drawn values of episodes that start. With at_ends
+ * also the arrays of last observations and infos, filled with NaN or zeros. */
 bool results_provide_starts(Results *results, bool at_ends, ResultArrays *arrays);
 void results_drop(const Results *results, ResultArrays *arrays);
 

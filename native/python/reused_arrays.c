@@ -14,17 +14,8 @@
 #error "the extension must be built with numpy 2 or newer"
 #endif
 
-/* Where objects of numpy.ndarray have the list of their weak references. */
-static Py_ssize_t weak_references;
-
 bool numpy_import(void) {
-    if (PyArray_ImportNumPyAPI() < 0) {
-        return false;
-    }
-    PyObject *place = PyObject_GetAttrString((PyObject *)&PyArray_Type, "__weakrefoffset__");
-    weak_references = place == NULL ? -1 : PyLong_AsSsize_t(place);
-    Py_XDECREF(place);
-    return weak_references >= 0;
+    return PyArray_ImportNumPyAPI() >= 0;
 }
 
 /* Taking over */
@@ -69,7 +60,7 @@ bool maker_take(Maker *maker, PyObject *arguments) {
 }
 
 void maker_drop(Maker *maker) {
-    for (size_t k = 0; k < ROUNDS; k++) {
+    for (size_t k = 0; k < KEPT_ARRAYS; k++) {
         Py_CLEAR(maker->made[k].array);
     }
     Py_CLEAR(maker->type);
@@ -93,7 +84,7 @@ const char *maker_memory_of(const Maker *maker, PyObject *object) {
 }
 
 static bool has_weak_references(PyObject *array) {
-    return *(PyObject **)((char *)array + weak_references) != NULL;
+    return ((PyArrayObject_fields *)array)->weakreflist != NULL;
 }
 
 /* Whether nobody else holds an array, refers to it weakly, or has changed it in place. */
@@ -132,7 +123,7 @@ void maker_blank(const Maker *maker, char *memory) {
 }
 
 PyObject *maker_provide(Maker *maker, char **memory) {
-    for (size_t k = 0; k < ROUNDS; k++) {
+    for (size_t k = 0; k < KEPT_ARRAYS; k++) {
         if (is_free(maker, &maker->made[k])) {
             *memory = maker->made[k].memory;
             return Py_NewRef(maker->made[k].array);
@@ -145,7 +136,7 @@ PyObject *maker_provide(Maker *maker, char **memory) {
     *memory = PyArray_BYTES(array);
     Made *place = &maker->made[maker->oldest];
     PyObject *before = place->array;
-    maker->oldest = (maker->oldest + 1) % ROUNDS;
+    maker->oldest = (maker->oldest + 1) % KEPT_ARRAYS;
     *place = (Made){.array = Py_NewRef((PyObject *)array), .memory = *memory};
     Py_XDECREF(before); /* may call back, and another step then replaces the new array */
     return (PyObject *)array;

@@ -7,7 +7,7 @@
 
 enum {
     MOST_ARRAY_DIMENSIONS = 64, /* more than that numpy has none */
-    ROUNDS = 2                  /* callers often hold the arrays of one step while they take the next */
+    KEPT_ARRAYS = 2             /* callers often hold the arrays of one step while they take the next */
 };
 
 typedef struct {
@@ -22,7 +22,7 @@ typedef struct {
     int dimensions;
     Py_ssize_t shape[MOST_ARRAY_DIMENSIONS], strides[MOST_ARRAY_DIMENSIONS];
     int flags; /* of a new array */
-    Made made[ROUNDS];
+    Made made[KEPT_ARRAYS];
     unsigned oldest;
 } Maker;
 

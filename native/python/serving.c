@@ -3,12 +3,12 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "python/programs.h"
+#include "python/python.h"
 
 #include "worker/process.h"
 #include "worker/worker.h"
 
-/* The worker is never freed: the process ends when it is done. */
+/* Serves requests until the channel closes. The worker is not freed: the process ends then. */
 PyObject *py_serve(PyObject *module, PyObject *args) {
     long long descriptor;
     int memory;

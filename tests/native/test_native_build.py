@@ -128,16 +128,16 @@ def test_the_table_of_operations_is_that_of_the_extension():
     from fmugym import _native
 
     program.require_same_table(_native)
-    assert _native.operations() == program.OPERATIONS
+    assert _native.OPERATIONS == program.OPERATIONS
 
 
 @pytest.mark.parametrize(
     "stale",
     [
         SimpleNamespace(),
-        SimpleNamespace(operations=lambda: program.OPERATIONS, MOST_REGISTERS=64),
-        SimpleNamespace(operations=lambda: program.OPERATIONS[:-1], MOST_REGISTERS=256),
-        SimpleNamespace(operations=lambda: program.OPERATIONS[::-1], MOST_REGISTERS=256),
+        SimpleNamespace(OPERATIONS=program.OPERATIONS, MOST_REGISTERS=64),
+        SimpleNamespace(OPERATIONS=program.OPERATIONS[:-1], MOST_REGISTERS=256),
+        SimpleNamespace(OPERATIONS=program.OPERATIONS[::-1], MOST_REGISTERS=256),
     ],
 )
 def test_a_stale_extension_is_refused_with_the_cure(stale):

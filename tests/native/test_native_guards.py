@@ -298,15 +298,18 @@ class TestPrograms:
     @pytest.mark.parametrize(
         "actions",
         [
-            {"shape": (3,)},
-            {"shape": (70000,)},
+            {"current": np.zeros((3, 3), np.int64)},
+            {"current": np.zeros(3, np.float32)},
+            {"current": np.zeros(3, np.complex64)},
+            {"previous": np.zeros((3, 1), np.int64)},
+            {"previous": np.zeros(3)},
             {"current": np.zeros(2, np.int64), "previous": np.zeros(2, np.int64)},
             {"none": np.zeros(1, np.int8)},
         ],
         ids=str,
     )
     def test_actions_that_do_not_fit(self, cart_poles, actions):
-        with pytest.raises(ValueError, match="action"):
+        with pytest.raises((TypeError, ValueError), match="action"):
             prepare(cart_poles, program(FAILED), actions=actions)
 
     @pytest.mark.parametrize(

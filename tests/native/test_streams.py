@@ -297,7 +297,7 @@ class TestGuards:
     def test_numbers_that_do_not_fit(self, row, numbers):
         from fmugym import _native
 
-        kind = row[0] if isinstance(row[0], int) else _native.distributions().index(row[0])
+        kind = row[0] if isinstance(row[0], int) else _native.DISTRIBUTIONS.index(row[0])
         table = np.array([kind, *row[1:]], np.int64)
         with pytest.raises(ValueError, match="numbers do not fit"):
             _native.Draws(form_of_draws(table, numbers), module._standard_normal())
@@ -316,7 +316,7 @@ class TestGuards:
     def test_too_few_start_values(self):
         from fmugym import _native
 
-        kind = _native.distributions().index("uniform")
+        kind = _native.DISTRIBUTIONS.index("uniform")
         table = np.array([[kind, 1, 0, 2]], np.int64)
         draws = _native.Draws(form_of_draws(table, np.array([0.0, 1.0])), 0)
         with pytest.raises(ValueError, match="too few rows"):

@@ -158,7 +158,7 @@ def pool_form(rng):
     def play():
         with refusals():
             pool = _native.Pool(form, arrays, print)
-            pool.step_own()
+            pool.step(None)
             pool.close()
 
     return Case(play, "pool")
@@ -177,7 +177,7 @@ def listing_form(rng):
 
 
 def draws_form(rng):
-    kinds = [_native.distributions().index(name) for name in ("uniform", "choice")]
+    kinds = [_native.DISTRIBUTIONS.index(name) for name in ("uniform", "choice")]
     table = [[kinds[0], 0, 0, 2], [kinds[1], -1, 2, 3]]
     form = damaged(rng, form_of_draws(table, [0.0, 1.0, 2.0, 3.0, 4.0]))
 
@@ -241,8 +241,6 @@ def play_of(inputs, outputs):
         **results_of(N, 1, 0),
     }
     actions = {
-        "shape": (),
-        "letter": "d",
         "size": 8,
         "check": 2,
         "lowest": 0,
@@ -268,7 +266,7 @@ def play_form(rng):
             prepare(pool, _native.Access(form_of_listing(())), *parts)
             for _ in range(3):
                 pool.play_before(np.zeros(N))
-                pool.play_after(np.zeros(N))
+                pool.play_after()
 
     return Case(play, "play")
 

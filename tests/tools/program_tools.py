@@ -8,8 +8,6 @@ from fmugym.pool.play_form import ArrayElement
 from fmugym.pool.pool_form import form_of_draws, form_of_program
 
 DISCRETE = {
-    "shape": (),
-    "letter": "q",
     "size": 8,
     "check": 1,
     "lowest": 0,
@@ -38,7 +36,7 @@ def constants(*values):
 
 def uniform_draws(*rows):
     """Uniform numbers from [0, 1), one for each row of the start values."""
-    kind = _native.distributions().index("uniform")
+    kind = _native.DISTRIBUTIONS.index("uniform")
     table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
     return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
 

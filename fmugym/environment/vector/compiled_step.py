@@ -28,7 +28,7 @@ from fmugym.environment.vector.quantity_arrays import (
     element_row,
 )
 from fmugym.environment.vector.task_programs import TaskPrograms, compile_formulas, formulas_of
-from fmugym.expressions.program import LETTERS, TYPES, Row, UncompilableError
+from fmugym.expressions.program import TYPES, Row, UncompilableError
 from fmugym.expressions.quantities import PREVIOUS
 from fmugym.pool.c_extension import require_refusal
 from fmugym.pool.play_form import ArrayElement, RowStart
@@ -221,16 +221,13 @@ def _actions(env: FMUEnv, arrays: EpisodeArrays) -> dict[str, Any]:
     is_discrete = isinstance(space, spaces.Discrete)
     check = 1 if is_discrete else _FLOAT_CHECKS.get(dtype, 0)
     low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
-    flat = [actions.reshape(-1) for actions in arrays.actions]
     return {
-        "shape": arrays.actions[0].shape[1:],
-        "letter": LETTERS.get(dtype, dtype.char),
         "size": dtype.itemsize,
         "check": check,
         "lowest": low,
         "highest": high,
-        "current": flat[0],
-        "previous": flat[1],
+        "current": arrays.actions[0],
+        "previous": arrays.actions[1],
         "none": np.array(env._conversions.no_action, dtype).reshape(-1),
     }
 

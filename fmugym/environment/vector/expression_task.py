@@ -253,7 +253,7 @@ class Expressions(VectorTask):
 
     def _conclude(self, taken: Any, idle: MaskArray | None, started: Any) -> StepResult:
         """See ``VectorTask._conclude``."""
-        result = self._completed(self._play.after(taken), idle)
+        result = self._completed(self._play.after(), idle)
         result[-1].update(started or {})
         return result
 

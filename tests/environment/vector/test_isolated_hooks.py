@@ -177,17 +177,21 @@ def test_a_pool_without_a_library_steps_nothing(make):
     envs.reset(seed=0)
     around = programs_for(envs.pool, envs.prototype.pool_spec)
     actions = np.zeros((3, 1), np.float32)
-    for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
+    for name, given in (
+        ("play", (actions, False)),
+        ("play_before", (actions,)),
+        ("play_after", ()),
+    ):
         with pytest.raises(ValueError, match="not prepared"):
-            getattr(around, name)(actions, *more)
+            getattr(around, name)(*given)
     before = envs.pool.outputs.copy()
-    assert around.step_own() == 3
+    assert around.step(None) == 3
     nothing = _native.Access(form_of_listing(()))
-    assert around.reset(nothing, np.zeros((0, 3)), None, None) == 3
+    assert around.reset(nothing, np.zeros((0, 3)), None) == 3
     code, answer = around.ask(Request.READ, request_listing((), 2))
     assert code == Answer.TROUBLE
     assert answer[:8] == bytes(8)
     np.testing.assert_array_equal(envs.pool.outputs, before)
     around.close()
     with pytest.raises(SimulationError, match="closed"):
-        around.step_own()
+        around.step(None)
