@@ -1,4 +1,4 @@
-"""Signals that end the command line: Ctrl-C, and others that end it in the same way.
+"""Signals that end the command line as Ctrl-C does.
 
 By default SIGTERM (of ``kill``, ``timeout`` and batch systems) and SIGHUP (of a terminal that
 closes) end a process at once, and its temporary folders remain. Ctrl-C waits for the FMU.
@@ -16,7 +16,7 @@ from typing import Final
 
 __all__ = ["SignalledEnd", "end_as_after_ctrl_c", "exit_code"]
 
-_NAMES: Final = ("SIGINT", "SIGTERM", "SIGHUP")
+_NAMES: Final = ("SIGTERM", "SIGHUP")
 
 _TIMEOUT: Final = 5.0
 """Seconds until the process is ended by force: its FMU may hang, and Python waits for the call."""
@@ -41,10 +41,11 @@ class SignalledEnd(KeyboardInterrupt):
 
 
 def end_as_after_ctrl_c() -> None:
-    """Let signals raise ``SignalledEnd``, except those that the process ignores (``nohup``).
+    """Let SIGTERM and SIGHUP raise ``SignalledEnd``, unless they are ignored (``nohup``) or handled.
 
-    To be called in the main thread. While an FMU works whose code is Python, they only note that
-    they shall; see ``fmugym.pool.held_signals``.
+    To be called in the main thread. If Python has not begun to end ``_TIMEOUT`` after a signal, the
+    process is killed. While an FMU of Python works, handlers wait; see
+    ``fmugym.pool.held_signals``.
     """
     numbers = {
         number

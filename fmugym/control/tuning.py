@@ -245,7 +245,10 @@ class CandidateSearch:
             self.agreement = 1.0
 
     def take_more_episodes(self) -> None:
-        """Take twice as many episodes, unless all are the same or they are enough."""
+        """Double the number of episodes, up to ``_MOST_EPISODES``; one stays one.
+
+        A single episode is enough where all are the same.
+        """
         if 1 < self.episodes < _MOST_EPISODES:
             self.episodes *= 2
 

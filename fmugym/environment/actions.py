@@ -65,7 +65,10 @@ def scaled_space(space: Any) -> spaces.Box:
 
 
 def unscaled(actions: npt.NDArray[Any], space: Any) -> npt.NDArray[Any]:
-    """The actions of the task for actions from -1 to 1, shape (..., *space.shape)."""
+    """Scale actions from [-1, 1] to the range of a space, shape (..., *space.shape).
+
+    Actions outside of [-1, 1] are clipped.
+    """
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     inside = np.clip(low + (high - low) * (np.asarray(actions, np.float64) + 1.0) / 2, low, high)
     found: npt.NDArray[Any] = inside.astype(space.dtype)
@@ -177,14 +180,14 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
 
 
 def take_action(env: Any, action: Any) -> tuple[Any, ...]:
-    """Let hooks make inputs of an action, and write them for the next step of the FMU.
+    """Compute the FMU's inputs from an action, and write them for the next step.
 
     Args:
         env: A single environment.
         action: The action.
 
     Returns:
-        What hooks have read before, for ``Episode.take_back``.
+        The quantities before this step, for ``Episode.take_back``.
 
     Raises:
         ConfigError: If it cannot be used. Then nothing has happened.

@@ -168,7 +168,7 @@ class Episode:
         return self.mapped(lambda value: value)
 
     def replaced(self, **values: Any) -> Episode:
-        """The same episode but for some."""
+        """A copy of the episode with other values of these quantities; the state follows outputs."""
         result = self.copy()
         for name, value in values.items():
             setattr(result, name, value)
@@ -194,14 +194,14 @@ class Episode:
         """Keep the quantities before the step that begins.
 
         Returns:
-            What ``take_back`` takes to return to before, if the FMU has not stepped.
+            For ``take_back``, if the FMU does not step.
         """
         before = self.previous, self.action, self.inputs
         self.previous = _present(self)
         return before
 
     def take_back(self, before: tuple[Any, ...]) -> None:
-        """Return to before ``keep``: to the action and the inputs of then, too."""
+        """Undo ``keep``: restore the quantities before the step, the action and the inputs."""
         self.previous, self.action, self.inputs = before
 
 

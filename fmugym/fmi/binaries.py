@@ -176,7 +176,7 @@ class ElfLibrary:
 
     @property
     def soname(self) -> str | None:
-        """The name by which other libraries know it."""
+        """The soname: the name by which other libraries need this one."""
         return next(iter(self._texts(_SONAME)), None)
 
     def search_path(self, folder: Path) -> list[Path]:

@@ -232,7 +232,7 @@ class Task:
 
     @property
     def name(self) -> str:
-        """The name of the file; ``"task"`` for a dict."""
+        """File name with its suffix; ``"task"`` for a dict."""
         path = self.sources[0].path
         return "task" if path is None else path.name
 

@@ -22,13 +22,10 @@ __all__ = ["explanation", "named_values"]
 
 
 def named_values(naming: Naming) -> dict[str, tuple[Quantity, Value]]:
-    """Find the quantities of a task, in its units.
+    """Quantities of a task by name, each with the expression of its value between steps.
 
     Args:
-        naming: Gives names their values.
-
-    Returns:
-        By name, the quantity and its value between two steps.
+        naming: Gives names their values. Names without a value are left out.
     """
     found: dict[str, tuple[Quantity, Value]] = {}
     for quantity in _quantities(naming):

@@ -23,7 +23,7 @@ from fmugym.control.candidate_evaluation import (
     CeilingError,
 )
 from fmugym.control.controller_parsing import plans_ahead, warmed
-from fmugym.control.surrogate.recorded_trajectories import Courses
+from fmugym.control.surrogate.recorded_trajectories import Trajectories
 from fmugym.control.tuning import NO_MERIT
 from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError, reading_file, reason, shown
@@ -240,7 +240,7 @@ class Searching:
         """
         self._begin = monotonic()
         self._seconds_of: dict[str, float] = {}
-        self._courses = Courses()
+        self._trajectories = Trajectories()
         self._found = self._resumed() if resume else self._begun()
         self._probe, self._before = self._found.probe, self._found.steps
         self._tell_the_plan(resume)
@@ -249,7 +249,7 @@ class Searching:
                 self._evaluator_of(self.make_env, self._probe.most_steps)
             ) as self._evaluator:
                 self._evaluator.steps = self._before
-                self._evaluator.backend = self._courses if self._on_surrogate else "auto"
+                self._evaluator.backend = self._trajectories if self._on_surrogate else "auto"
                 winner = self._winner()
             return self._judged(winner)
         finally:
@@ -262,7 +262,7 @@ class Searching:
             raise ConfigError(f"{self.steps} steps are too few: give {_LEAST} or more")
         most = int(min(MOST_PROBED, self.steps // _OF_PROBE))
         tested = int(min(MOST_TESTED, (self.steps - most) / _TESTED))
-        backend = "auto" if most == MOST_PROBED else self._courses
+        backend = "auto" if most == MOST_PROBED else self._trajectories
         seconds = self.seconds / _OF_PROBE
         probe = Probe.of(self.make_env, self.envs, self.tell, most, backend, seconds, tested)
         agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
@@ -370,7 +370,7 @@ class Searching:
         twin = TwinSearch(
             self._found,
             self._evaluator,
-            self._courses,
+            self._trajectories,
             self.steps if limited else steps,
             np.inf if limited else left,
             self.rounds,

@@ -1,4 +1,4 @@
-/* Reader of forms: numbers, texts, arrays and variables as bytes, checked. */
+/* Reader of forms. A form is numbers, texts, arrays and variables as bytes; each read is checked. */
 
 #include "forms/form.h"
 

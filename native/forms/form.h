@@ -35,7 +35,8 @@ const void *read_array(Reader *reader, size_t size, size_t *count);
 const char *read_text(Reader *reader);
 /* Texts; the caller frees the array. Returns NULL if there is a fault. */
 const char **read_texts(Reader *reader, size_t *count);
-/* The version and manner of an FMU, or NULL with a fault if there is none. */
+/* The table of functions for an FMI version and a kind of interface (manner_of in Python). NULL with a
+ * fault if there is none. */
 const Fmi *read_fmi(Reader *reader);
 /* A list of variables, which the caller closes. Returns whether there is no fault. */
 bool read_access(Reader *reader, const Fmi *fmi, Access *access);

@@ -1,5 +1,5 @@
-/* How fast the rates change with the states and the time, for methods that need it: from the FMU's
- * directional derivatives, or from differences. */
+/* Jacobian of the state derivatives, and their derivative by time: from the FMU's directional derivatives,
+ * or from differences. */
 
 #include <math.h>
 #include <string.h>

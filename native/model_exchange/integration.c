@@ -259,7 +259,7 @@ static Status count_try(Solver *me) {
                        method->stiffness != NULL ? ADVICE : "");
 }
 
-/* Tells once that the method is not the right one. Counts tries, not time. */
+/* Warns once that the equations are stiff. Looks at every EVERY_TRY-th try after MANY_TRIES. */
 static void watch_stiffness(Solver *me, double end) {
     const Method *method = me->solving->method;
 

@@ -377,7 +377,8 @@ static void read_loop(Reader *reader, LoopLimits *loop, bool *has_loop, const ch
     }
 }
 
-/* Routes, and how many values they carry. A loop that solves for these needs memory. */
+/* Reads the routes of a group or transfer, counts their values, and grows the loop memory of the system
+ * to fit. */
 static const uint32_t *read_solved(Reader *reader, System *s, size_t *count, size_t *unknowns) {
     const uint32_t *routes = read_indices(reader, s->number_of_routes, count);
 

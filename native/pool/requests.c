@@ -106,7 +106,7 @@ static Answer answer_read(Asked *a) {
     return answer(a, failed);
 }
 
-/* The variables of a part of a system have the functions of its FMU. */
+/* Directional or adjoint derivatives of an FMU; in a system, of one of its parts. */
 static Answer answer_differentiate(Asked *a) {
     const Settings *s = &a->pool->settings;
     const bool adjoint = read_flag(a->reader);

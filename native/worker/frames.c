@@ -1,4 +1,4 @@
-/* Messages over a connection. */
+/* Frames of the worker's protocol: requests and answers over its channel. */
 
 #include "worker/frames.h"
 

@@ -1,4 +1,4 @@
-"""Courses of an FMU: trajectories of its episodes, and a pool that keeps them."""
+"""Trajectories of an FMU in its episodes, and a pool that records them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.pool import FloatArray, MaskArray, Play, Pool, PoolSpec, StatusArray
 from fmugym.pool.pool_spec import ResetMethod
 
-__all__ = ["Course", "Courses", "RecordingPool"]
+__all__ = ["Trajectory", "Trajectories", "RecordingPool"]
 
 
-class Course(NamedTuple):
+class Trajectory(NamedTuple):
     """Trajectory of an episode of an FMU, or of its beginning.
 
     Attributes:
@@ -39,8 +39,8 @@ class Course(NamedTuple):
         return len(self.inputs)
 
 
-class Courses:
-    """Courses of an FMU; as the ``backend`` of environments, the object keeps their episodes.
+class Trajectories:
+    """Trajectories of an FMU; as the ``backend`` of environments, the object keeps their episodes.
 
     Attributes:
         spec: Specification of a step; None before there is one.
@@ -63,27 +63,27 @@ class Courses:
         log: logging.Logger,
         options: PoolOptions,
     ) -> RecordingPool:
-        """Open a pool of the FMU whose courses are kept; see ``fmugym.pool.opening.open_pool``."""
+        """Open a pool of the FMU whose trajectories are kept; see ``fmugym.pool.opening.open_pool``."""
         self.spec = spec
         options = replace(options, backend="auto")
         return RecordingPool(open_pool(fmu, spec, num_instances, log, options), spec, self)
 
     def begin(self, starts: FloatArray, outputs: FloatArray) -> _Open:
-        """Begin a course, to which ``RecordingPool`` adds steps."""
+        """Start to record a trajectory, to which ``RecordingPool`` adds steps."""
         self._open.append(_Open(starts.copy(), [], [outputs.copy()]))
         return self._open[-1]
 
-    def all(self) -> list[Course]:
-        """All courses until now, also the ones without a step."""
+    def all(self) -> list[Trajectory]:
+        """All trajectories until now, also the ones without a step."""
         width = 0 if self.spec is None else len(self.spec.inputs)
         return [
-            Course(starts, np.reshape(inputs, (len(inputs), width)), np.array(outputs))
+            Trajectory(starts, np.reshape(inputs, (len(inputs), width)), np.array(outputs))
             for starts, inputs, outputs in self._open
         ]
 
 
 class _Open(NamedTuple):
-    """Course of an episode that is not over."""
+    """Trajectory of an episode that is not over."""
 
     starts: FloatArray
     inputs: list[FloatArray]
@@ -91,16 +91,16 @@ class _Open(NamedTuple):
 
 
 class RecordingPool(Pool):
-    """Pool that keeps the courses of another pool.
+    """Pool that keeps the trajectories of another pool.
 
     Args:
         pool: Steps the FMU.
         spec: Specification of a step.
-        courses: Collection of the courses.
+        trajectories: Collection of the trajectories.
     """
 
-    def __init__(self, pool: Pool, spec: PoolSpec, courses: Courses) -> None:
-        self._pool, self._spec, self._courses = pool, spec, courses
+    def __init__(self, pool: Pool, spec: PoolSpec, trajectories: Trajectories) -> None:
+        self._pool, self._spec, self._trajectories = pool, spec, trajectories
         self.num_instances, self.step_own = pool.num_instances, self._step_own
         self.execution = pool.execution
         self.inputs, self.outputs = pool.inputs, pool.outputs
@@ -112,11 +112,11 @@ class RecordingPool(Pool):
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
         self._pool.reset(variables, values, mask)
-        self._courses.variables = variables
+        self._trajectories.variables = variables
         for index in _places(mask, self.num_instances):
             started = self.statuses[index] <= WARNING_CODE
             row = values[:, index], self.outputs[:, index]
-            self._now[index] = self._courses.begin(*row) if started else None
+            self._now[index] = self._trajectories.begin(*row) if started else None
         return self.outputs, self.statuses
 
     def step(
@@ -127,7 +127,7 @@ class RecordingPool(Pool):
         """See ``Pool.step``."""
         self._pool.step(inputs, skip)
         for index in _places(None if skip is None else ~skip, self.num_instances):
-            self._courses.steps += 1
+            self._trajectories.steps += 1
             if self.statuses[index] > WARNING_CODE:
                 self._now[index] = None
             if self._now[index] is not None:

@@ -80,7 +80,7 @@ class SurrogatePool(CountedPool):
         return self.outputs, self.statuses
 
     def _places_in(self, variables: tuple[Variable, ...]) -> list[int]:
-        """Places of the variables that were set in the courses.
+        """Places of the variables that were set in the trajectories.
 
         Raises:
             SimulationError: If others are set, too: nobody knows what they change.
@@ -189,7 +189,7 @@ class SurrogatePool(CountedPool):
 
 @dataclass(frozen=True)
 class Surrogate:
-    """Model of a step of an FMU, fitted to its courses.
+    """Model of a step of an FMU, fitted to its trajectories.
 
     Given as the ``backend`` of environments, it steps in the place of the FMU.
 

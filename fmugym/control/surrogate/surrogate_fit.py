@@ -1,4 +1,4 @@
-"""Fit of a surrogate to the courses of an FMU.
+"""Fit of a surrogate to the trajectories of an FMU.
 
 Its predictions are compared with the FMU in episodes that the fit has not seen.
 """
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.control.surrogate.recorded_trajectories import Course, Courses
+from fmugym.control.surrogate.recorded_trajectories import Trajectory, Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of, simulated
 from fmugym.errors import ConfigError
@@ -26,7 +26,7 @@ __all__ = ["Prediction", "fit", "plot_prediction", "predicted"]
 _FOLDS: Final = 3
 _PENALTIES: Final = (1e-8, 1e-6, 1e-4, 1e-2)
 _HORIZON: Final = 48
-"""The steps of a simulation, at most; a quarter of the longest course is enough."""
+"""The steps of a simulation, at most; a quarter of the longest trajectory is enough."""
 
 _TIE: Final = 0.95
 """A larger model must have less than this part of the error of a smaller one."""
@@ -35,22 +35,22 @@ _LAGS: Final = 4
 _TANHS: Final = 60
 _GRID: Final = 15
 _BEYOND: Final = 0.2
-"""Outputs stay in their range in the courses, which is so much wider on both sides."""
+"""Outputs stay in their range in the trajectories, which is so much wider on both sides."""
 
 _FEW: Final = 5
 """An output may be limited if it is so often at an end of its range, after a step."""
 
 
-def fit(courses: Courses) -> Surrogate:
+def fit(trajectories: Trajectories) -> Surrogate:
     """Fit a surrogate.
 
-    Forms compete by the errors of simulations of courses that the fit has not seen. They begin with
+    Forms compete by the errors of simulations of trajectories that the fit has not seen. They begin with
     the linear one; what lessens the error most is added until nothing does.
 
     Raises:
         ConfigError: If there are no steps.
     """
-    data = _Data(courses)
+    data = _Data(trajectories)
     best, form = data.trial(data.linear), data.linear
     while True:
         found = [(*data.trial(one), one) for one in data.extensions(form)]
@@ -64,14 +64,14 @@ def fit(courses: Courses) -> Surrogate:
 
 
 class _Data:
-    """Courses of a fit, and the courses that each fold leaves out."""
+    """Trajectories of a fit, and the trajectories that each fold leaves out."""
 
-    def __init__(self, courses: Courses) -> None:
-        spec = courses.spec
-        self.all = [one for one in courses.all() if one.steps]
+    def __init__(self, trajectories: Trajectories) -> None:
+        spec = trajectories.spec
+        self.all = [one for one in trajectories.all() if one.steps]
         if not self.all or spec is None:
-            raise ConfigError("a surrogate needs courses with steps")
-        self.courses, self.spec = courses, spec
+            raise ConfigError("a surrogate needs trajectories with steps")
+        self.trajectories, self.spec = trajectories, spec
         self.widths = len(spec.outputs), len(spec.inputs)
         angles = [i for i, one in enumerate(spec.outputs) if one.unit == "rad"]
         self.linear = SurrogateForm(angles=tuple(angles))
@@ -114,18 +114,18 @@ class _Data:
     # The fit of one form.
 
     def _matrices(
-        self, form: SurrogateForm, courses: Sequence[Course]
+        self, form: SurrogateForm, trajectories: Sequence[Trajectory]
     ) -> tuple[FloatArray, FloatArray]:
-        first = form.lags  # before this step, what a course begins with does not tell its past
-        rows = np.concatenate([regressors_of(form, one)[:, first:] for one in courses], axis=1)
-        changes = np.concatenate([np.diff(one.outputs, axis=0)[first:] for one in courses])
+        first = form.lags  # before this step, what a trajectory begins with does not tell its past
+        rows = np.concatenate([regressors_of(form, one)[:, first:] for one in trajectories], axis=1)
+        changes = np.concatenate([np.diff(one.outputs, axis=0)[first:] for one in trajectories])
         return rows, changes / self.size
 
     def _weights(
-        self, form: SurrogateForm, courses: Sequence[Course], penalties: Sequence[float]
+        self, form: SurrogateForm, trajectories: Sequence[Trajectory], penalties: Sequence[float]
     ) -> tuple[Terms, list[FloatArray]]:
         """The terms, and for each penalty the weights, shape (f, k)."""
-        rows, changes = self._matrices(form, courses)
+        rows, changes = self._matrices(form, trajectories)
         terms = Terms.fitted_to(form, rows, self.widths)
         values = terms.values(rows)
         found = np.zeros((len(penalties), len(values), len(self.size)))
@@ -147,13 +147,13 @@ class _Data:
         return float(mean.min()), _PENALTIES[int(mean.argmin())]
 
     def _fold(self, form: SurrogateForm, number: int) -> FloatArray:
-        """The error of each penalty in the courses of one fold."""
+        """The error of each penalty in the trajectories of one fold."""
         kept, left = self._split(number)
         terms, weights = self._weights(form, kept, _PENALTIES)
         return _simulation_errors(terms, weights, left, self.horizon, self)
 
-    def _split(self, number: int) -> tuple[list[Course], list[Course]]:
-        """Courses of a fit, and courses for its test."""
+    def _split(self, number: int) -> tuple[list[Trajectory], list[Trajectory]]:
+        """Trajectories of a fit, and trajectories for its test."""
         long = [one for one in self.all if one.steps >= self.horizon] or self.all
         pieces = self.all if len(long) >= 2 * _FOLDS else list(_pieces(self.all, 2 * self.horizon))
         left = [one for place, one in enumerate(pieces) if place % _FOLDS == number]
@@ -182,11 +182,11 @@ class _Data:
         return None if best[0] == np.inf else best[1:]
 
     def fitted(self, form: SurrogateForm, error: float, penalty: float) -> Surrogate:
-        """The surrogate of a form, fitted to all courses."""
+        """The surrogate of a form, fitted to all trajectories."""
         terms, (weights,) = self._weights(form, self.all, [penalty])
-        start = Start.of(self.courses.variables, self.courses.all())
+        start = Start.of(self.trajectories.variables, self.trajectories.all())
         low, high = self.bounds(form)
-        about = self.spec, self.courses.variables
+        about = self.spec, self.trajectories.variables
         return Surrogate(terms, weights.T, low, high, start, error, *about)
 
 
@@ -198,28 +198,34 @@ def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:
     return float(np.square(changes - both.T @ weights).mean())
 
 
-def _pieces(courses: Sequence[Course], steps: int) -> Iterator[Course]:
-    """Parts of courses of so many steps."""
-    for starts, inputs, outputs in courses:
+def _pieces(trajectories: Sequence[Trajectory], steps: int) -> Iterator[Trajectory]:
+    """Parts of trajectories of so many steps."""
+    for starts, inputs, outputs in trajectories:
         for begin in range(0, len(inputs), steps):
-            yield Course(starts, inputs[begin : begin + steps], outputs[begin : begin + steps + 1])
+            yield Trajectory(
+                starts, inputs[begin : begin + steps], outputs[begin : begin + steps + 1]
+            )
 
 
 def _simulation_errors(
-    terms: Terms, weights: Sequence[FloatArray], courses: Sequence[Course], horizon: int, data: Any
+    terms: Terms,
+    weights: Sequence[FloatArray],
+    trajectories: Sequence[Trajectory],
+    horizon: int,
+    data: Any,
 ) -> FloatArray:
     """The root mean square error of outputs in simulations, for each set of weights.
 
-    Simulations begin everywhere in the courses, and last so many steps. Errors count beside the
+    Simulations begin everywhere in the trajectories, and last so many steps. Errors count beside the
     spread of the output.
     """
-    horizon = min(horizon, max(one.steps for one in courses))
+    horizon = min(horizon, max(one.steps for one in trajectories))
     windows = [
         (
             regressors_of(terms.form, one)[:, begin : begin + horizon],
             one.outputs[begin + 1 :][:horizon],
         )
-        for one in courses
+        for one in trajectories
         for begin in range(0, one.steps - horizon + 1, max(1, horizon // 2))
     ]
     rows = np.stack([rows for rows, _ in windows], axis=1)  # d, windows, steps
@@ -244,44 +250,44 @@ class Prediction(NamedTuple):
     """A surrogate beside the FMU.
 
     Attributes:
-        course: An episode of the FMU.
+        trajectory: An episode of the FMU.
         outputs: Outputs that the surrogate predicts from its beginning on, shape (T + 1, k).
         errors: The root mean square error of predictions that begin everywhere in the episodes,
             by the number of their steps, shape (h, k).
         spread: The standard deviation of the outputs in the episodes, shape (k,).
     """
 
-    course: Course
+    trajectory: Trajectory
     outputs: FloatArray
     errors: FloatArray
     spread: FloatArray
 
 
-def predicted(surrogate: Surrogate, courses: Sequence[Course]) -> Prediction:
+def predicted(surrogate: Surrogate, trajectories: Sequence[Trajectory]) -> Prediction:
     """Predict episodes by a surrogate, from the FMU's inputs and first outputs.
 
     Args:
         surrogate: The surrogate.
-        courses: Courses of the FMU, each with a step at least; the longest one is shown.
+        trajectories: Trajectories of the FMU, each with a step at least; the longest one is shown.
     """
     terms, bounds = surrogate.terms, (surrogate.low, surrogate.high)
-    longest = max(courses, key=lambda one: one.steps)
+    longest = max(trajectories, key=lambda one: one.steps)
     rows = regressors_of(terms.form, longest)[:, None]
     after = [*simulated(terms, [surrogate.weights.T], bounds, rows)]
     outputs = np.concatenate([longest.outputs[:1], np.array(after)[:, :, 0]])
     horizon = max(1, longest.steps // _PART)
-    squares = [_squares(surrogate, one, horizon) for one in courses if one.steps >= horizon]
+    squares = [_squares(surrogate, one, horizon) for one in trajectories if one.steps >= horizon]
     errors = np.sqrt(np.concatenate(squares, axis=1).mean(axis=1))
-    spread = np.concatenate([one.outputs for one in courses]).std(axis=0)
+    spread = np.concatenate([one.outputs for one in trajectories]).std(axis=0)
     return Prediction(longest, outputs, errors, spread)
 
 
-def _squares(surrogate: Surrogate, course: Course, horizon: int) -> FloatArray:
+def _squares(surrogate: Surrogate, trajectory: Trajectory, horizon: int) -> FloatArray:
     """The squared errors of predictions from each step on, shape (horizon, n, k)."""
-    begins = range(course.steps - horizon + 1)
-    rows = regressors_of(surrogate.terms.form, course)
+    begins = range(trajectory.steps - horizon + 1)
+    rows = regressors_of(surrogate.terms.form, trajectory)
     windows = np.stack([rows[:, one : one + horizon] for one in begins], axis=1)
-    true = np.stack([course.outputs[one + 1 :][:horizon] for one in begins], axis=1)
+    true = np.stack([trajectory.outputs[one + 1 :][:horizon] for one in begins], axis=1)
     bounds = surrogate.low, surrogate.high
     after = np.array([*simulated(surrogate.terms, [surrogate.weights.T], bounds, windows)])
     return np.square(after.swapaxes(1, 2) - true)
@@ -296,23 +302,29 @@ def plot_prediction(prediction: Prediction, surrogate: Surrogate) -> Figure:
     from fmugym.rendering.figures import Figure
 
     variables, time_step = surrogate.spec.outputs, surrogate.spec.time_step
-    length = time_step * prediction.course.steps
+    length = time_step * prediction.trajectory.steps
     _, scale, unit = next(one for one in _UNITS if length >= one[0])
     count = len(variables)
     figure = Figure(figsize=(9, 1 + 1.8 * count), layout="constrained")
     axes = figure.subplots(count, 2, sharex="col", squeeze=False, width_ratios=[2, 1])
-    times = time_step / scale * np.arange(prediction.course.steps + 1)
+    times = time_step / scale * np.arange(prediction.trajectory.steps + 1)
     horizons = times[1 : len(prediction.errors) + 1]
-    for place, (variable, (course, error)) in enumerate(zip(variables, axes, strict=True)):
-        course.plot(times, prediction.course.outputs[:, place], color="0.6", lw=2.0, label="FMU")
-        course.plot(times, prediction.outputs[:, place], color="#0072b2", lw=1.0, label="surrogate")
-        course.set_ylabel(f"{variable.name} [{variable.unit}]" if variable.unit else variable.name)
+    for place, (variable, (trajectory, error)) in enumerate(zip(variables, axes, strict=True)):
+        trajectory.plot(
+            times, prediction.trajectory.outputs[:, place], color="0.6", lw=2.0, label="FMU"
+        )
+        trajectory.plot(
+            times, prediction.outputs[:, place], color="#0072b2", lw=1.0, label="surrogate"
+        )
+        trajectory.set_ylabel(
+            f"{variable.name} [{variable.unit}]" if variable.unit else variable.name
+        )
         error.plot(
             horizons, prediction.errors[:, place], color="#0072b2", label="error of the surrogate"
         )
         error.axhline(prediction.spread[place], color="0.6", ls="--", label="spread of the output")
         error.set_ylim(bottom=0.0)
-        for one in (course, error):
+        for one in (trajectory, error):
             one.grid(alpha=0.3)
     axes[0][0].set_title("an episode that the fit has not seen")
     axes[0][1].set_title("root mean square error")

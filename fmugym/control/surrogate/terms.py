@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.control.surrogate.recorded_trajectories import Course
+from fmugym.control.surrogate.recorded_trajectories import Trajectory
 from fmugym.expressions.graph import Graph, Value, where
 from fmugym.fmi.variable import Variable
 from fmugym.pool.pool import FloatArray
@@ -19,7 +19,7 @@ from fmugym.pool.pool import FloatArray
 __all__ = ["Start", "SurrogateForm", "Terms", "regressors_of", "rows_in", "simulated"]
 
 _BEYOND: Final = 0.2
-"""Numbers are clipped to their range in the courses, which is so much wider on both sides."""
+"""Numbers are clipped to their range in the trajectories, which is so much wider on both sides."""
 
 _STEEPNESS: Final = 1.5
 """Root mean square of the argument of a tanh."""
@@ -38,7 +38,7 @@ class SurrogateForm:
         quadratic: Whether all products of two count.
         tanhs: How many functions tanh of random sums there are.
         starts: Whether it depends on what is set before initialization.
-        limited: The outputs that an end of their range in the courses limits.
+        limited: The outputs that an end of their range in the trajectories limits.
     """
 
     lags: int = 0
@@ -63,18 +63,18 @@ class SurrogateForm:
         return replace(self, thresholds=(*self.thresholds, (place, value)))
 
 
-def regressors_of(form: SurrogateForm, course: Course) -> FloatArray:
-    """Regressors of the steps of a course, shape (d, T).
+def regressors_of(form: SurrogateForm, trajectory: Trajectory) -> FloatArray:
+    """Regressors of the steps of a trajectory, shape (d, T).
 
     These are the outputs, their changes in earlier steps, the inputs, their changes, and the
     values set before initialization. Before an episode, nothing has changed.
     """
-    parts = [course.outputs[:-1].T]
-    parts += [_changes(course.outputs[:-1].T, lag) for lag in range(form.lags)]
-    parts += [course.inputs.T]
-    parts += [_changes(course.inputs.T, lag) for lag in range(form.lags)]
+    parts = [trajectory.outputs[:-1].T]
+    parts += [_changes(trajectory.outputs[:-1].T, lag) for lag in range(form.lags)]
+    parts += [trajectory.inputs.T]
+    parts += [_changes(trajectory.inputs.T, lag) for lag in range(form.lags)]
     if form.starts:
-        parts.append(np.repeat(course.starts[:, None], course.steps, axis=1))
+        parts.append(np.repeat(trajectory.starts[:, None], trajectory.steps, axis=1))
     return np.concatenate(parts)
 
 
@@ -142,7 +142,7 @@ class Terms:
         return int(self.mixing.shape[1]) - 1 + len(self.mixing) + len(self.form.thresholds)
 
     def _scaled(self, row: Sequence[Any], number: Number = float) -> list[Value]:
-        """Factors that are scaled numbers, without numbers that are constant in the courses."""
+        """Factors that are scaled numbers, without numbers that are constant in the trajectories."""
         outputs = self.widths[0]
         found: list[Value] = []
         for place, value in enumerate(row):
@@ -211,7 +211,7 @@ def simulated(
     bounds: tuple[FloatArray, FloatArray],
     rows: FloatArray,
 ) -> Iterator[FloatArray]:
-    """Simulate by numpy, from places in courses on.
+    """Simulate by numpy, from places in trajectories on.
 
     Args:
         terms: Terms of the changes of outputs.
@@ -241,7 +241,7 @@ def simulated(
 
 _PENALTY: Final = 1e-8
 _BEYOND_AT_START: Final = 0.5
-"""Outputs begin in their range in the courses, which is so much wider on both sides."""
+"""Outputs begin in their range in the trajectories, which is so much wider on both sides."""
 
 
 @dataclass(frozen=True)
@@ -263,9 +263,9 @@ class Start:
     weights: FloatArray
 
     @classmethod
-    def of(cls, variables: Sequence[Variable], courses: Sequence[Course]) -> Start:
-        """The fit to the starts of courses, equal ones once."""
-        several = list({one.starts.tobytes(): one for one in courses}.values())
+    def of(cls, variables: Sequence[Variable], trajectories: Sequence[Trajectory]) -> Start:
+        """The fit to the starts of trajectories, equal ones once."""
+        several = list({one.starts.tobytes(): one for one in trajectories}.values())
         given = np.array([one.starts for one in several])
         first = np.array([one.outputs[0] for one in several])
         deviation = given.std(axis=0)

@@ -192,15 +192,15 @@ def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
 
 
 def keys_of(env: FMUEnv, seed: Any) -> dict[str, float]:
-    """Draw the keys of the noise of later steps.
+    """Draw the noise keys that the candidates of a rollout share.
 
     Args:
         env: The prototype.
-        seed: That of all candidates, which nobody's luck then tells apart; None if they go on with
-            the random numbers of their snapshot.
+        seed: Seed of the noise. All candidates get the same noise, so that luck does not rank them.
+            With None, they go on with the noise of their snapshot.
 
     Raises:
-        ConfigError: If it is no seed.
+        ConfigError: If the seed is none.
     """
     first, future = check_seed(seed), future_of(env)
     if first is None or future is None:

@@ -207,5 +207,5 @@ def _pair(result: Any) -> tuple[Any, int]:
 
 
 def describe_error(error: Exception) -> str:
-    """Describe an exception of a backend: its text, with the type of a foreign one."""
+    """The text of an exception; its type comes first unless it is a ``SimulationError``."""
     return f"{error}" if isinstance(error, SimulationError) else f"{type(error).__name__}: {error}"

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from fmugym.control.candidate_evaluation import CandidateEvaluator
 from fmugym.control.controller import Controller
 from fmugym.control.controller_parsing import has_range, search_of
-from fmugym.control.surrogate.recorded_trajectories import Course, Courses
+from fmugym.control.surrogate.recorded_trajectories import Trajectory, Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit
 from fmugym.pool.pool import FloatArray
@@ -58,7 +58,7 @@ _EPISODES: Final = 8
 
 def fitted_surrogate(
     make_env: Callable[[], Any], steps: int, seed: int = 0, unseen: int = 0
-) -> tuple[Surrogate, list[Course]]:
+) -> tuple[Surrogate, list[Trajectory]]:
     """Excite an FMU, and fit a surrogate to the trajectories.
 
     Args:
@@ -68,12 +68,12 @@ def fitted_surrogate(
         unseen: How many more episodes are played afterwards, for a test. Their steps do not count.
 
     Returns:
-        The surrogate, and the courses of these episodes.
+        The surrogate, and the trajectories of these episodes.
 
     Raises:
         ConfigError: If no policy can be searched for the task, or its first step always fails.
     """
-    courses, rng = Courses(), np.random.default_rng(seed)
+    trajectories, rng = Trajectories(), np.random.default_rng(seed)
     most = max(_GROUP, steps // _OF_PROBE)
     probe = Probe.of(
         make_env,
@@ -81,21 +81,21 @@ def fitted_surrogate(
         lambda line: None,
         most_tested=steps // _OF_TEST,
         most=most,
-        backend=courses,
+        backend=trajectories,
     )
-    length = max(1, min(probe.most_steps, (steps - courses.steps) // _EPISODES))
-    with closing(CandidateEvaluator(make_env, _GROUP, length, backend=courses)) as evaluator:
-        excite(evaluator, courses, probe, (steps - courses.steps) // length, rng)
-        found, known = fit(courses), len(courses.all())
+    length = max(1, min(probe.most_steps, (steps - trajectories.steps) // _EPISODES))
+    with closing(CandidateEvaluator(make_env, _GROUP, length, backend=trajectories)) as evaluator:
+        excite(evaluator, trajectories, probe, (steps - trajectories.steps) // length, rng)
+        found, known = fit(trajectories), len(trajectories.all())
         if unseen:
             evaluator.most_steps = probe.most_steps
-            excite(evaluator, courses, probe, unseen, rng)
-    return found, [one for one in courses.all()[known:] if one.steps]
+            excite(evaluator, trajectories, probe, unseen, rng)
+    return found, [one for one in trajectories.all()[known:] if one.steps]
 
 
 def excite(
     evaluator: CandidateEvaluator,
-    courses: Courses,
+    trajectories: Trajectories,
     probe: Probe,
     count: int,
     rng: np.random.Generator,
@@ -103,8 +103,8 @@ def excite(
     """Play episodes with the untuned controllers of a task, whose actions are disturbed.
 
     Args:
-        evaluator: Its episodes are no longer than they shall be; its backend are the courses.
-        courses: Keep what the FMU does.
+        evaluator: Its episodes are no longer than they shall be; its backend are the trajectories.
+        trajectories: Keep what the FMU does.
         probe: Probe of the task.
         count: How many episodes there are.
         rng: Draws episodes and actions.
@@ -119,9 +119,9 @@ def excite(
     envs = evaluator.open(1)
     starts = rng.integers(_SEEDS, size=_STARTS)
     for begin in range(0, _STARTS, envs.num_envs):
-        before = courses.steps
+        before = trajectories.steps
         envs.reset(seed=np.resize(starts[begin:], envs.num_envs).tolist())
-        if probe.is_same or courses.steps > before:  # warm-ups take steps, too
+        if probe.is_same or trajectories.steps > before:  # warm-ups take steps, too
             return
 
 

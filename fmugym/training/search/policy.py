@@ -347,10 +347,10 @@ _NO_NETWORK: Final = ResidualAgent("")
 class ResidualPolicy(Controller):
     """A controller whose action a network corrects.
 
-    Of a ``Box`` the action is that of the controller, and half of the range times what the network
-    gives. Of a ``Discrete`` or a ``MultiDiscrete`` the largest output of each part chooses, among
-    what the method ``action_masks`` of the environment allows, if it has one. Without weights it is
-    the controller's own action.
+    In a ``Box``, the action is that of the controller plus the network's output times half of the
+    range. In a ``Discrete`` or ``MultiDiscrete`` space, the largest output of each part chooses; the
+    method ``action_masks`` of the environment, if there is one, limits the choice. Without weights,
+    the action is the controller's own.
 
     Args:
         baseline: The controller; None for the middle of the range.

@@ -9,7 +9,7 @@ from time import monotonic
 from typing import Final, NamedTuple
 
 from fmugym.control.candidate_evaluation import CandidateEvaluator, CandidateScores, Merit
-from fmugym.control.surrogate.recorded_trajectories import Courses
+from fmugym.control.surrogate.recorded_trajectories import Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit
 from fmugym.errors import ConfigError
@@ -83,8 +83,8 @@ class TwinSearch:
 
     Attributes:
         found: The search.
-        evaluator: The FMU's; its courses are kept.
-        courses: Courses of the FMU.
+        evaluator: The FMU's; its trajectories are kept.
+        trajectories: Trajectories of the FMU.
         steps: How many steps of the FMU there may be.
         seconds: The real time that is left.
         rounds: The largest number of rounds.
@@ -95,7 +95,7 @@ class TwinSearch:
 
     found: Search
     evaluator: CandidateEvaluator
-    courses: Courses
+    trajectories: Trajectories
     steps: float
     seconds: float
     rounds: float
@@ -122,7 +122,7 @@ class TwinSearch:
                 "for a surrogate: give more --minutes or --steps"
             )
         count = max(_FEWEST, round(_EXCITED * self.steps / self.length))
-        excite(self.evaluator, self.courses, self.found.probe, count, self.found.rng)
+        excite(self.evaluator, self.trajectories, self.found.probe, count, self.found.rng)
         for cycle in range(_CYCLES):
             surrogate = self._fitted()
             with closing(self._evaluator_on(surrogate)) as twin:
@@ -147,7 +147,7 @@ class TwinSearch:
     # The search on the surrogate.
 
     def _fitted(self) -> Surrogate:
-        found = fit(self.courses)
+        found = fit(self.trajectories)
         self.tell(
             f"surrogate of {self.evaluator.steps} steps: {found.terms.form}; errors of "
             f"simulations are {100 * found.error:.2g} % of the variation of outputs"

@@ -1,4 +1,4 @@
-"""Surrogates: recorded courses, the fit, the programs, and the pool that they step."""
+"""Surrogates: recorded trajectories, the fit, the programs, and the pool that they step."""
 
 from contextlib import closing
 from dataclasses import replace
@@ -9,7 +9,7 @@ import pytest
 from surrogate_tools import surrogate_of
 
 from fmugym import FMUVectorEnv
-from fmugym.control.surrogate.recorded_trajectories import Course, Courses
+from fmugym.control.surrogate.recorded_trajectories import Trajectory, Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit, predicted
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of
@@ -18,10 +18,10 @@ from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.variable import Variable
 
 
-class Given(Courses):
-    """Courses that were computed, of outputs y and inputs u."""
+class Given(Trajectories):
+    """Trajectories that were computed, of outputs y and inputs u."""
 
-    def __init__(self, outputs, inputs, courses):
+    def __init__(self, outputs, inputs, trajectories):
         super().__init__()
         names = [f"y{i}" for i in range(outputs)], [f"u{i}" for i in range(inputs)]
         made = [
@@ -29,18 +29,18 @@ class Given(Courses):
         ]
         self.spec = SimpleNamespace(outputs=made[0], inputs=made[1])
         self.variables = (Variable("y_0", "Real", 0, "parameter", "fixed", "exact"),)
-        self._given = courses
+        self._given = trajectories
 
     def all(self):
         return self._given
 
 
 def played(step, state, inputs, seen=slice(None)):
-    """The course of a difference equation."""
+    """The trajectory of a difference equation."""
     states = [np.array(state, float)]
     for row in inputs:
         states.append(step(states[-1], row))
-    return Course(states[0][:1], np.array(inputs), np.array(states)[:, seen])
+    return Trajectory(states[0][:1], np.array(inputs), np.array(states)[:, seen])
 
 
 def courses_of(step, width, outputs, inputs, seen=slice(None), count=8, steps=120):
@@ -52,17 +52,19 @@ def courses_of(step, width, outputs, inputs, seen=slice(None), count=8, steps=12
     return Given(outputs, inputs, given)
 
 
-def simulated(surrogate, course, begin):
-    """The outputs of a surrogate on the inputs of a course, by the definition of its rows."""
-    now = Course(course.starts, course.inputs[:begin], course.outputs[: begin + 1])
-    for place in range(begin, course.steps):
+def simulated(surrogate, trajectory, begin):
+    """The outputs of a surrogate on the inputs of a trajectory, by the definition of its rows."""
+    now = Trajectory(trajectory.starts, trajectory.inputs[:begin], trajectory.outputs[: begin + 1])
+    for place in range(begin, trajectory.steps):
         both = np.concatenate([now.outputs, now.outputs[-1:]])
         row = regressors_of(
-            surrogate.terms.form, Course(now.starts, course.inputs[: place + 1], both)
+            surrogate.terms.form, Trajectory(now.starts, trajectory.inputs[: place + 1], both)
         )
         change = surrogate.weights @ surrogate.terms.values(row[:, -1:])[:, 0]
         after = np.clip(now.outputs[-1] + change, surrogate.low, surrogate.high)
-        now = Course(now.starts, course.inputs[: place + 1], np.vstack([now.outputs, after]))
+        now = Trajectory(
+            now.starts, trajectory.inputs[: place + 1], np.vstack([now.outputs, after])
+        )
     return now.outputs
 
 
@@ -106,7 +108,7 @@ class TestFit:
 
     def test_there_must_be_steps(self):
         with pytest.raises(ConfigError, match="steps"):
-            fit(Courses())
+            fit(Trajectories())
 
 
 class TestPrograms:
@@ -124,7 +126,7 @@ class TestPrograms:
     )
     def test_programs_are_what_numpy_computes(self, form):
         rng = np.random.default_rng(1)
-        given = Course(rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2)))
+        given = Trajectory(rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2)))
         rows = regressors_of(form, given)
         terms = Terms.fitted_to(form, rows, (2, 2))
         rows = np.ascontiguousarray(1.5 * rows)  # some of them are outside of the range
@@ -139,8 +141,8 @@ class TestPrograms:
 
 
 def test_courses_are_what_the_fmu_does():
-    courses = Courses()
-    made = FMUVectorEnv(PendulumEnv, 3, backend=courses), FMUVectorEnv(PendulumEnv, 3)
+    trajectories = Trajectories()
+    made = FMUVectorEnv(PendulumEnv, 3, backend=trajectories), FMUVectorEnv(PendulumEnv, 3)
     with closing(made[0]) as envs, closing(made[1]) as own:
         for one in (envs, own):
             one.reset(seed=5)
@@ -149,12 +151,12 @@ def test_courses_are_what_the_fmu_does():
         for action in torques:
             assert np.array_equal(envs.step(action)[0], own.step(action)[0])
             expected.append(own.pool.outputs.copy())
-    assert courses.steps == 21
-    for place, course in enumerate(courses.all()):
-        assert np.array_equal(course.outputs, np.array(expected)[:, :, place])
-        assert course.inputs[:, 0] == pytest.approx(torques[:, place, 0], rel=1e-6)
-        assert [one.name for one in courses.variables][:2] == ["theta_0", "theta_dot_0"]
-        assert course.starts[0] == pytest.approx(course.outputs[0, 0])
+    assert trajectories.steps == 21
+    for place, trajectory in enumerate(trajectories.all()):
+        assert np.array_equal(trajectory.outputs, np.array(expected)[:, :, place])
+        assert trajectory.inputs[:, 0] == pytest.approx(torques[:, place, 0], rel=1e-6)
+        assert [one.name for one in trajectories.variables][:2] == ["theta_0", "theta_dot_0"]
+        assert trajectory.starts[0] == pytest.approx(trajectory.outputs[0, 0])
 
 
 @pytest.fixture(scope="module")
@@ -276,11 +278,11 @@ class TestPrediction:
     def test_it_is_what_the_pool_does(self):
         """Of an episode from its beginning on; errors are those of the definition."""
         found = surrogate_of(PendulumEnv, held=4, steps=100)
-        courses = Courses()
+        trajectories = Trajectories()
         rng = np.random.default_rng(3)
         actions = rng.uniform(-2, 2, (40, 2, 1)).astype(np.float32)
         outputs = []
-        for backend in (courses, found):
+        for backend in (trajectories, found):
             with closing(FMUVectorEnv(PendulumEnv, 2, backend=backend)) as envs:
                 envs.reset(seed=5)
                 pool = envs.pool
@@ -289,15 +291,15 @@ class TestPrediction:
                     envs.step(action)
                     rows.append(pool.outputs.copy())
                 outputs.append(np.array(rows))
-        one, other = courses.all()
+        one, other = trajectories.all()
         result = predicted(found, [one, other])
         begin = one.outputs[:1] - outputs[1][0, :, 0]  # starts are fitted, too
         assert np.abs(begin).max() < 0.02
-        assert result.course is one
+        assert result.trajectory is one
         assert result.outputs == pytest.approx(outputs[1][:, :, 0], abs=0.3)
         assert result.errors.shape == (20, 2)
         last = [
-            simulated(found, Course(c.starts, c.inputs[: b + 20], c.outputs[: b + 21]), b)[-1]
+            simulated(found, Trajectory(c.starts, c.inputs[: b + 20], c.outputs[: b + 21]), b)[-1]
             - c.outputs[b + 20]
             for c in (one, other)
             for b in range(21)

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 
 from fmugym.control.candidate_evaluation import CandidateEvaluator
-from fmugym.control.surrogate.recorded_trajectories import Courses
+from fmugym.control.surrogate.recorded_trajectories import Trajectories
 from fmugym.envs import CartPoleEnv, PendulumEnv
 from fmugym.training.search.excitation import excite
 from fmugym.training.search.policy import ResidualAgent
 
 
 def excited(make_env, envs, steps=60, count=7):
-    courses = Courses()
+    trajectories = Trajectories()
     acting = {PendulumEnv: 1, CartPoleEnv: 2}[make_env]  # two levels
     probe = SimpleNamespace(agents=[ResidualAgent("constant action", acting=acting)], is_same=False)
-    with closing(CandidateEvaluator(make_env, envs, steps, backend=courses)) as evaluator:
-        excite(evaluator, courses, probe, count, np.random.default_rng(5))
-        assert evaluator.steps == courses.steps
-    return [one for one in courses.all() if one.steps]
+    with closing(CandidateEvaluator(make_env, envs, steps, backend=trajectories)) as evaluator:
+        excite(evaluator, trajectories, probe, count, np.random.default_rng(5))
+        assert evaluator.steps == trajectories.steps
+    return [one for one in trajectories.all() if one.steps]
 
 
 @pytest.mark.parametrize("make_env", [PendulumEnv, CartPoleEnv])
