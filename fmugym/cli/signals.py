@@ -41,7 +41,7 @@ class SignalledEnd(KeyboardInterrupt):
 
 
 def end_as_after_ctrl_c() -> None:
-    """Let SIGTERM and SIGHUP raise ``SignalledEnd``, unless they are ignored (``nohup``) or handled.
+    """Let SIGTERM and SIGHUP raise ``SignalledEnd``, unless they are ignored or handled.
 
     To be called in the main thread. If Python has not begun to end ``_TIMEOUT`` after a signal, the
     process is killed. While an FMU of Python works, handlers wait; see

@@ -168,7 +168,7 @@ class Episode:
         return self.mapped(lambda value: value)
 
     def replaced(self, **values: Any) -> Episode:
-        """A copy of the episode with other values of these quantities; the state follows outputs."""
+        """A copy of the episode with other values of these quantities; outputs make the state."""
         result = self.copy()
         for name, value in values.items():
             setattr(result, name, value)

@@ -20,7 +20,7 @@ from math import floor, isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from fmugym.checks import check_option
+from fmugym.checks import check_option, has_method
 from fmugym.errors import ConfigError, FMULoadError, first_of, printable, warn_once
 from fmugym.fmi.fmu import FMU
 from fmugym.fmi.wine import Wine
@@ -369,8 +369,9 @@ def open_pool(
     """
     _require_allowed(fmu, spec, num_instances)
     backend = options.backend
-    if hasattr(backend, "open_pool"):
-        own: Pool = backend.open_pool(fmu, spec, num_instances, log, options)
+    given: Any = backend
+    if has_method(given, "open_pool"):
+        own: Pool = given.open_pool(fmu, spec, num_instances, log, options)
         return own
     if not isinstance(backend, str):
         pool = BackendPool(fmu, spec, num_instances, backend)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 from fmugym.environment.distributions import is_distribution
@@ -39,7 +40,7 @@ def times_of(naming: Naming) -> dict[str, Any]:
         times["substeps"] = substeps.value
     with length.noting():
         if length.value is not None:
-            times["max_episode_steps"] = steps_in(length, length.value, time_step)
+            times["max_episode_steps"] = steps_in(length, length.value, time_step, sys.maxsize)
     with start.noting():
         if start.value is not None:
             steps = times.get("max_episode_steps", 0)

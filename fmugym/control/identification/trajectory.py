@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import Spellings, by_own_names, check_mapping, check_text
+from fmugym.checks import Spellings, by_own_names, check_mapping, check_text, items_of
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.pool import FloatArray, MaskArray
 
@@ -94,9 +94,9 @@ def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[st
     Raises:
         ConfigError: If something is not a trajectory, there is none, or the names differ.
     """
-    _require_trajectories(trajectories)
-    outputs, inputs = list(trajectories[0].outputs), list(trajectories[0].inputs)
-    for other in trajectories:
+    first, *others = _checked(trajectories)
+    outputs, inputs = list(first.outputs), list(first.inputs)
+    for other in others:
         if set(other.outputs) != set(outputs) or set(other.inputs) != set(inputs):
             raise ConfigError("all trajectories must have the same outputs and the same inputs")
     return outputs, inputs
@@ -115,23 +115,23 @@ def named_as_own(
         ConfigError: If something is not a trajectory, there is none, or two names of a trajectory
             stand for the same variable.
     """
-    _require_trajectories(trajectories)
     return [
         replace(
             one,
             outputs=by_own_names("the outputs of a trajectory", one.outputs, own_name),
             inputs=by_own_names("the inputs of a trajectory", one.inputs, own_name),
         )
-        for one in trajectories
+        for one in _checked(trajectories)
     ]
 
 
-def _require_trajectories(trajectories: Any) -> None:
-    is_list = isinstance(trajectories, Sequence)
-    if not (is_list and all(isinstance(one, Trajectory) for one in trajectories)):
+def _checked(trajectories: Any) -> list[Trajectory]:
+    items = items_of(trajectories) if isinstance(trajectories, Sequence) else None
+    if items is None or not all(isinstance(one, Trajectory) for one in items):
         raise ConfigError(f"expected a list of trajectories, not {shown(trajectories)}")
-    if not trajectories:
+    if not items:
         raise ConfigError("expected at least one trajectory")
+    return items
 
 
 def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:

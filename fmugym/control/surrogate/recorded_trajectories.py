@@ -17,7 +17,7 @@ from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.pool import FloatArray, MaskArray, Play, Pool, PoolSpec, StatusArray
 from fmugym.pool.pool_spec import ResetMethod
 
-__all__ = ["Trajectory", "Trajectories", "RecordingPool"]
+__all__ = ["RecordingPool", "Trajectories", "Trajectory"]
 
 
 class Trajectory(NamedTuple):
@@ -63,7 +63,7 @@ class Trajectories:
         log: logging.Logger,
         options: PoolOptions,
     ) -> RecordingPool:
-        """Open a pool of the FMU whose trajectories are kept; see ``fmugym.pool.opening.open_pool``."""
+        """Open a pool of the FMU that is recorded; see ``fmugym.pool.opening.open_pool``."""
         self.spec = spec
         options = replace(options, backend="auto")
         return RecordingPool(open_pool(fmu, spec, num_instances, log, options), spec, self)

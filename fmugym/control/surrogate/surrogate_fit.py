@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.control.surrogate.recorded_trajectories import Trajectory, Trajectories
+from fmugym.control.surrogate.recorded_trajectories import Trajectories, Trajectory
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of, simulated
 from fmugym.errors import ConfigError
@@ -44,8 +44,8 @@ _FEW: Final = 5
 def fit(trajectories: Trajectories) -> Surrogate:
     """Fit a surrogate.
 
-    Forms compete by the errors of simulations of trajectories that the fit has not seen. They begin with
-    the linear one; what lessens the error most is added until nothing does.
+    Forms compete by the errors of simulations of trajectories that the fit has not seen. They begin
+    with the linear one; what lessens the error most is added until nothing does.
 
     Raises:
         ConfigError: If there are no steps.
@@ -216,8 +216,8 @@ def _simulation_errors(
 ) -> FloatArray:
     """The root mean square error of outputs in simulations, for each set of weights.
 
-    Simulations begin everywhere in the trajectories, and last so many steps. Errors count beside the
-    spread of the output.
+    Simulations begin everywhere in the trajectories, and last so many steps. Errors count beside
+    the spread of the output.
     """
     horizon = min(horizon, max(one.steps for one in trajectories))
     windows = [

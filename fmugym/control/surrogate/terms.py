@@ -142,7 +142,7 @@ class Terms:
         return int(self.mixing.shape[1]) - 1 + len(self.mixing) + len(self.form.thresholds)
 
     def _scaled(self, row: Sequence[Any], number: Number = float) -> list[Value]:
-        """Factors that are scaled numbers, without numbers that are constant in the trajectories."""
+        """Factors that are scaled numbers, without those that the trajectories never change."""
         outputs = self.widths[0]
         found: list[Value] = []
         for place, value in enumerate(row):

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from fmugym.control.candidate_evaluation import CandidateEvaluator
 from fmugym.control.controller import Controller
 from fmugym.control.controller_parsing import has_range, search_of
-from fmugym.control.surrogate.recorded_trajectories import Trajectory, Trajectories
+from fmugym.control.surrogate.recorded_trajectories import Trajectories, Trajectory
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit
 from fmugym.pool.pool import FloatArray

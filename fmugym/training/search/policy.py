@@ -348,9 +348,9 @@ class ResidualPolicy(Controller):
     """A controller whose action a network corrects.
 
     In a ``Box``, the action is that of the controller plus the network's output times half of the
-    range. In a ``Discrete`` or ``MultiDiscrete`` space, the largest output of each part chooses; the
-    method ``action_masks`` of the environment, if there is one, limits the choice. Without weights,
-    the action is the controller's own.
+    range. In a ``Discrete`` or ``MultiDiscrete`` space, the largest output of each part chooses;
+    the method ``action_masks`` of the environment, if there is one, limits the choice. Without
+    weights, the action is the controller's own.
 
     Args:
         baseline: The controller; None for the middle of the range.

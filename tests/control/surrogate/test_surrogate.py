@@ -9,7 +9,7 @@ import pytest
 from surrogate_tools import surrogate_of
 
 from fmugym import FMUVectorEnv
-from fmugym.control.surrogate.recorded_trajectories import Trajectory, Trajectories
+from fmugym.control.surrogate.recorded_trajectories import Trajectories, Trajectory
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit, predicted
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of
