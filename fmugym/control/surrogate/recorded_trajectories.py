@@ -17,11 +17,11 @@ from fmugym.pool.opening import PoolOptions, open_pool
 from fmugym.pool.pool import FloatArray, MaskArray, Play, Pool, PoolSpec, StatusArray
 from fmugym.pool.pool_spec import ResetMethod
 
-__all__ = ["RecordingPool", "Trajectories", "Trajectory"]
+__all__ = ["EpisodeTrajectory", "RecordingPool", "Trajectories"]
 
 
-class Trajectory(NamedTuple):
-    """Trajectory of an episode of an FMU, or of its beginning.
+class EpisodeTrajectory(NamedTuple):
+    """EpisodeTrajectory of an episode of an FMU, or of its beginning.
 
     Attributes:
         starts: The values set before initialization, shape (p,).
@@ -73,17 +73,17 @@ class Trajectories:
         self._open.append(_Open(starts.copy(), [], [outputs.copy()]))
         return self._open[-1]
 
-    def all(self) -> list[Trajectory]:
+    def all(self) -> list[EpisodeTrajectory]:
         """All trajectories until now, also the ones without a step."""
         width = 0 if self.spec is None else len(self.spec.inputs)
         return [
-            Trajectory(starts, np.reshape(inputs, (len(inputs), width)), np.array(outputs))
+            EpisodeTrajectory(starts, np.reshape(inputs, (len(inputs), width)), np.array(outputs))
             for starts, inputs, outputs in self._open
         ]
 
 
 class _Open(NamedTuple):
-    """Trajectory of an episode that is not over."""
+    """EpisodeTrajectory of an episode that is not over."""
 
     starts: FloatArray
     inputs: list[FloatArray]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.control.surrogate.recorded_trajectories import Trajectories, Trajectory
+from fmugym.control.surrogate.recorded_trajectories import EpisodeTrajectory, Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of, simulated
 from fmugym.errors import ConfigError
@@ -114,7 +114,7 @@ class _Data:
     # The fit of one form.
 
     def _matrices(
-        self, form: SurrogateForm, trajectories: Sequence[Trajectory]
+        self, form: SurrogateForm, trajectories: Sequence[EpisodeTrajectory]
     ) -> tuple[FloatArray, FloatArray]:
         first = form.lags  # before this step, what a trajectory begins with does not tell its past
         rows = np.concatenate([regressors_of(form, one)[:, first:] for one in trajectories], axis=1)
@@ -122,7 +122,10 @@ class _Data:
         return rows, changes / self.size
 
     def _weights(
-        self, form: SurrogateForm, trajectories: Sequence[Trajectory], penalties: Sequence[float]
+        self,
+        form: SurrogateForm,
+        trajectories: Sequence[EpisodeTrajectory],
+        penalties: Sequence[float],
     ) -> tuple[Terms, list[FloatArray]]:
         """The terms, and for each penalty the weights, shape (f, k)."""
         rows, changes = self._matrices(form, trajectories)
@@ -152,7 +155,7 @@ class _Data:
         terms, weights = self._weights(form, kept, _PENALTIES)
         return _simulation_errors(terms, weights, left, self.horizon, self)
 
-    def _split(self, number: int) -> tuple[list[Trajectory], list[Trajectory]]:
+    def _split(self, number: int) -> tuple[list[EpisodeTrajectory], list[EpisodeTrajectory]]:
         """Trajectories of a fit, and trajectories for its test."""
         long = [one for one in self.all if one.steps >= self.horizon] or self.all
         pieces = self.all if len(long) >= 2 * _FOLDS else list(_pieces(self.all, 2 * self.horizon))
@@ -198,11 +201,11 @@ def _left(values: FloatArray, more: FloatArray, changes: FloatArray) -> float:
     return float(np.square(changes - both.T @ weights).mean())
 
 
-def _pieces(trajectories: Sequence[Trajectory], steps: int) -> Iterator[Trajectory]:
+def _pieces(trajectories: Sequence[EpisodeTrajectory], steps: int) -> Iterator[EpisodeTrajectory]:
     """Parts of trajectories of so many steps."""
     for starts, inputs, outputs in trajectories:
         for begin in range(0, len(inputs), steps):
-            yield Trajectory(
+            yield EpisodeTrajectory(
                 starts, inputs[begin : begin + steps], outputs[begin : begin + steps + 1]
             )
 
@@ -210,7 +213,7 @@ def _pieces(trajectories: Sequence[Trajectory], steps: int) -> Iterator[Trajecto
 def _simulation_errors(
     terms: Terms,
     weights: Sequence[FloatArray],
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[EpisodeTrajectory],
     horizon: int,
     data: Any,
 ) -> FloatArray:
@@ -257,13 +260,13 @@ class Prediction(NamedTuple):
         spread: The standard deviation of the outputs in the episodes, shape (k,).
     """
 
-    trajectory: Trajectory
+    trajectory: EpisodeTrajectory
     outputs: FloatArray
     errors: FloatArray
     spread: FloatArray
 
 
-def predicted(surrogate: Surrogate, trajectories: Sequence[Trajectory]) -> Prediction:
+def predicted(surrogate: Surrogate, trajectories: Sequence[EpisodeTrajectory]) -> Prediction:
     """Predict episodes by a surrogate, from the FMU's inputs and first outputs.
 
     Args:
@@ -282,7 +285,7 @@ def predicted(surrogate: Surrogate, trajectories: Sequence[Trajectory]) -> Predi
     return Prediction(longest, outputs, errors, spread)
 
 
-def _squares(surrogate: Surrogate, trajectory: Trajectory, horizon: int) -> FloatArray:
+def _squares(surrogate: Surrogate, trajectory: EpisodeTrajectory, horizon: int) -> FloatArray:
     """The squared errors of predictions from each step on, shape (horizon, n, k)."""
     begins = range(trajectory.steps - horizon + 1)
     rows = regressors_of(surrogate.terms.form, trajectory)

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.control.surrogate.recorded_trajectories import Trajectory
+from fmugym.control.surrogate.recorded_trajectories import EpisodeTrajectory
 from fmugym.expressions.graph import Graph, Value, where
 from fmugym.fmi.variable import Variable
 from fmugym.pool.pool import FloatArray
@@ -63,7 +63,7 @@ class SurrogateForm:
         return replace(self, thresholds=(*self.thresholds, (place, value)))
 
 
-def regressors_of(form: SurrogateForm, trajectory: Trajectory) -> FloatArray:
+def regressors_of(form: SurrogateForm, trajectory: EpisodeTrajectory) -> FloatArray:
     """Regressors of the steps of a trajectory, shape (d, T).
 
     These are the outputs, their changes in earlier steps, the inputs, their changes, and the
@@ -263,7 +263,7 @@ class Start:
     weights: FloatArray
 
     @classmethod
-    def of(cls, variables: Sequence[Variable], trajectories: Sequence[Trajectory]) -> Start:
+    def of(cls, variables: Sequence[Variable], trajectories: Sequence[EpisodeTrajectory]) -> Start:
         """The fit to the starts of trajectories, equal ones once."""
         several = list({one.starts.tobytes(): one for one in trajectories}.values())
         given = np.array([one.starts for one in several])

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from fmugym.control.candidate_evaluation import CandidateEvaluator
 from fmugym.control.controller import Controller
 from fmugym.control.controller_parsing import has_range, search_of
-from fmugym.control.surrogate.recorded_trajectories import Trajectories, Trajectory
+from fmugym.control.surrogate.recorded_trajectories import EpisodeTrajectory, Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit
 from fmugym.pool.pool import FloatArray
@@ -58,7 +58,7 @@ _EPISODES: Final = 8
 
 def fitted_surrogate(
     make_env: Callable[[], Any], steps: int, seed: int = 0, unseen: int = 0
-) -> tuple[Surrogate, list[Trajectory]]:
+) -> tuple[Surrogate, list[EpisodeTrajectory]]:
     """Excite an FMU, and fit a surrogate to the trajectories.
 
     Args:

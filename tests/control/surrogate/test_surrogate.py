@@ -9,7 +9,7 @@ import pytest
 from surrogate_tools import surrogate_of
 
 from fmugym import FMUVectorEnv
-from fmugym.control.surrogate.recorded_trajectories import Trajectories, Trajectory
+from fmugym.control.surrogate.recorded_trajectories import EpisodeTrajectory, Trajectories
 from fmugym.control.surrogate.surrogate import Surrogate
 from fmugym.control.surrogate.surrogate_fit import fit, predicted
 from fmugym.control.surrogate.terms import Start, SurrogateForm, Terms, regressors_of
@@ -40,7 +40,7 @@ def played(step, state, inputs, seen=slice(None)):
     states = [np.array(state, float)]
     for row in inputs:
         states.append(step(states[-1], row))
-    return Trajectory(states[0][:1], np.array(inputs), np.array(states)[:, seen])
+    return EpisodeTrajectory(states[0][:1], np.array(inputs), np.array(states)[:, seen])
 
 
 def courses_of(step, width, outputs, inputs, seen=slice(None), count=8, steps=120):
@@ -54,15 +54,18 @@ def courses_of(step, width, outputs, inputs, seen=slice(None), count=8, steps=12
 
 def simulated(surrogate, trajectory, begin):
     """The outputs of a surrogate on the inputs of a trajectory, by the definition of its rows."""
-    now = Trajectory(trajectory.starts, trajectory.inputs[:begin], trajectory.outputs[: begin + 1])
+    now = EpisodeTrajectory(
+        trajectory.starts, trajectory.inputs[:begin], trajectory.outputs[: begin + 1]
+    )
     for place in range(begin, trajectory.steps):
         both = np.concatenate([now.outputs, now.outputs[-1:]])
         row = regressors_of(
-            surrogate.terms.form, Trajectory(now.starts, trajectory.inputs[: place + 1], both)
+            surrogate.terms.form,
+            EpisodeTrajectory(now.starts, trajectory.inputs[: place + 1], both),
         )
         change = surrogate.weights @ surrogate.terms.values(row[:, -1:])[:, 0]
         after = np.clip(now.outputs[-1] + change, surrogate.low, surrogate.high)
-        now = Trajectory(
+        now = EpisodeTrajectory(
             now.starts, trajectory.inputs[: place + 1], np.vstack([now.outputs, after])
         )
     return now.outputs
@@ -126,7 +129,9 @@ class TestPrograms:
     )
     def test_programs_are_what_numpy_computes(self, form):
         rng = np.random.default_rng(1)
-        given = Trajectory(rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2)))
+        given = EpisodeTrajectory(
+            rng.normal(size=1), rng.uniform(size=(40, 2)), rng.normal(size=(41, 2))
+        )
         rows = regressors_of(form, given)
         terms = Terms.fitted_to(form, rows, (2, 2))
         rows = np.ascontiguousarray(1.5 * rows)  # some of them are outside of the range
@@ -299,7 +304,9 @@ class TestPrediction:
         assert result.outputs == pytest.approx(outputs[1][:, :, 0], abs=0.3)
         assert result.errors.shape == (20, 2)
         last = [
-            simulated(found, Trajectory(c.starts, c.inputs[: b + 20], c.outputs[: b + 21]), b)[-1]
+            simulated(
+                found, EpisodeTrajectory(c.starts, c.inputs[: b + 20], c.outputs[: b + 21]), b
+            )[-1]
             - c.outputs[b + 20]
             for c in (one, other)
             for b in range(21)
