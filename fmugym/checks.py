@@ -241,14 +241,6 @@ def check_flag(what: str, value: Any) -> bool:
     return bool(number)
 
 
-def items_of(value: Any) -> list[Any] | None:
-    """Items of an iterable; None if it is none, or if its own methods fail."""
-    try:
-        return list(value)
-    except Exception:  # the object's own method fails
-        return None
-
-
 def has_method(value: object, name: str) -> bool:
     """Whether a value has a method of this name; no, if asking it raises an error."""
     try:

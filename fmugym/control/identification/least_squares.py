@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan, items_of
+from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan
 from fmugym.control.identification.simulator import FitSettings, Simulator
 from fmugym.control.identification.trajectory import Comparison, Trajectory, common_names
 from fmugym.environment.fmu_variables import start_variable
@@ -489,8 +489,11 @@ def _levenberg_marquardt(
 
 def _limits(variable: Variable, limits: ParameterLimits) -> tuple[float, float, float]:
     """Return start value, lower and upper bound of a parameter."""
-    entries = items_of(limits) if isinstance(limits, tuple | list | np.ndarray) else [limits]
-    numbers = tuple(float_or_nan(entry) for entry in entries or ())
+    entries = limits if isinstance(limits, tuple | list | np.ndarray) else (limits,)
+    try:
+        numbers = tuple(float_or_nan(entry) for entry in entries)
+    except Exception:  # the object's own method fails
+        numbers = ()
     if len(numbers) == 1:
         numbers = (*numbers, variable.minimum, variable.maximum)
     elif len(numbers) == 2:

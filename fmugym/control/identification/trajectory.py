@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import Spellings, by_own_names, check_mapping, check_text, items_of
+from fmugym.checks import Spellings, by_own_names, check_mapping, check_text
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.pool import FloatArray, MaskArray
 
@@ -126,12 +126,16 @@ def named_as_own(
 
 
 def _checked(trajectories: Any) -> list[Trajectory]:
-    items = items_of(trajectories) if isinstance(trajectories, Sequence) else None
-    if items is None or not all(isinstance(one, Trajectory) for one in items):
+    try:
+        is_list = isinstance(trajectories, Sequence)
+        good = is_list and all(isinstance(one, Trajectory) for one in trajectories)
+    except Exception:  # the object's own method fails
+        good = False
+    if not good:
         raise ConfigError(f"expected a list of trajectories, not {shown(trajectories)}")
-    if not items:
+    if not trajectories:
         raise ConfigError("expected at least one trajectory")
-    return items
+    return list(trajectories)
 
 
 def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:
