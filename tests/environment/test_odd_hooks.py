@@ -253,6 +253,12 @@ def test_an_odd_result_is_refused(way, name, odd):
 
 
 @pytest.mark.parametrize("way", WAYS)
+def test_an_array_is_no_dict(way):
+    with pytest.raises(FMUGymError, match="_get_observation returned"):
+        play(way, odd_class(Nested, {"_get_observation": returning(np.zeros(NUM_ENVS))}))
+
+
+@pytest.mark.parametrize("way", WAYS)
 def test_an_error_of_a_hook_reaches_the_caller(way):
     with pytest.raises(HookError):
         play(way, odd_class(Swing, {"_is_done": raising(HookError)}, first=1))

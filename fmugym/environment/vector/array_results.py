@@ -130,10 +130,10 @@ def _mismatch(hook: str, value: Any, wanted: str) -> ConfigError:
 
 def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
     """Turn the result of ``_get_observation`` into new arrays with environments first, not last."""
-    is_array = type(value) is np.ndarray and value.dtype == space.dtype
+    hook, is_dict = "_get_observation", isinstance(space, spaces.Dict)
+    is_array = type(value) is np.ndarray and not is_dict and value.dtype == space.dtype
     if is_array and value.shape == (*_shape_of(space), count):
         return np.array(environments_first(value), order="C")
-    hook = "_get_observation"
     given(value, hook)
     if isinstance(space, spaces.Dict):
         if type(value) is dict and value.keys() == space.spaces.keys():
