@@ -20,7 +20,7 @@ static void playing_free(Playing *playing) {
     release_rows(&playing->rows);
     Py_XDECREF(playing->start);
     Py_XDECREF(playing->draws);
-    results_free(playing->results);
+    results_drop(&playing->results);
     free(playing);
 }
 
@@ -140,29 +140,31 @@ static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
 
 static bool results_fit(const PyPool *self, const Playing *playing) {
     const Settings *s = &self->pool.settings;
-    const Results *r = playing->results;
+    const Results *r = &playing->results;
     const Play *play = &playing->form.play;
     const size_t drawn = play->draws->count * s->count * sizeof(double);
-    bool fit = (s->count == 1 || !results_are_of_one(r)) &&
-               results_number_of_seen(r) == play->number_of_seen &&
-               results_size(r, results_place(r, MASK_ARRAY)) == s->count &&
-               results_size(r, results_place(r, DRAWN_ARRAY)) == drawn;
+    bool fit = (s->count == 1 || !r->are_of_one) &&
+               r->number_of_seen == play->number_of_seen &&
+               r->makers[results_place(r, MASK_ARRAY)].size == s->count &&
+               r->makers[results_place(r, DRAWN_ARRAY)].size == drawn;
 
     for (size_t i = 0; fit && i < MOST_ARRAYS; i++) {
         const size_t size = play->array_sizes[i];
-        fit = i < play->number_of_arrays ? size > 0 && results_size(r, i) == s->count * size
+        fit = i < play->number_of_arrays ? size > 0 && r->makers[i].size == s->count * size
                                          : size == 0;
     }
     return fit;
 }
 
 static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
-    playing->results = results_take(parts);
-    if (playing->results != NULL && !results_fit(self, playing)) {
+    if (!results_take(&playing->results, parts)) {
+        return false;
+    }
+    if (!results_fit(self, playing)) {
         PyErr_SetString(PyExc_ValueError, "the arrays of results do not fit the pool");
         return false;
     }
-    return playing->results != NULL;
+    return true;
 }
 
 /* What comes later refers to what comes first. */

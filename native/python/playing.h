@@ -18,7 +18,7 @@ enum {
     PLAY_BUFFERS
 };
 
-/* The result of prepare_play. It never changes; the next call replaces it as a whole. */
+/* The result of prepare_play, which the next call replaces as a whole. */
 typedef struct {
     PlayForm form;
     PyRows rows;
@@ -26,7 +26,7 @@ typedef struct {
     Item action_item;
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;
-    Results *results;
+    Results results;
 } Playing;
 
 /* Of a capsule that prepare_play has made. */

@@ -133,7 +133,7 @@ static bool take_states(PyObject *sequence, Asking *a) {
 }
 
 /* A tuple of the blocks that are all that was written. */
-static PyObject *tuple_of(const Writer *writer) {
+static PyObject *blocks_of(const Writer *writer) {
     Reader reader = {writer->bytes, writer->bytes + writer->size, NULL}, ahead = reader;
     Py_ssize_t count = 0;
 
@@ -159,7 +159,7 @@ static PyObject *answer_of(const Asking *a) {
         return PyErr_NoMemory();
     }
     return a->request == REQUEST_SAVE && a->answer == ANSWER_RESULT
-               ? Py_BuildValue("iN", (int)a->answer, tuple_of(writer))
+               ? Py_BuildValue("iN", (int)a->answer, blocks_of(writer))
                : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }
 

@@ -7,7 +7,7 @@
 /* One call that plays. */
 typedef struct {
     PyObject *capsule; /* keeps what was prepared alive */
-    const Playing *playing;
+    Playing *playing; /* only the arrays of its results change */
     Py_buffer actions;
     int64_t number; /* the action of the only environment, if it is an integer */
     Turn turn;
@@ -47,17 +47,13 @@ static void end_turn(PyTurn *t) {
 
 /* Actions. Those of another type or shape come back as an exception; the caller then converts them. */
 
-static bool is_of_one(const Playing *playing) {
-    return playing->results != NULL && results_are_of_one(playing->results);
-}
-
 static bool take_array(const Playing *playing, PyObject *actions, Py_buffer *b) {
     const Py_buffer *kept = &playing->buffers[CURRENT];
 
     if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
         return false;
     }
-    const int first = is_of_one(playing) && b->ndim == kept->ndim - 1;
+    const int first = playing->results.are_of_one && b->ndim == kept->ndim - 1;
     return buffer_fits(b, IN_PLACE, "the actions", playing->action_item, kept->ndim - first,
                        kept->shape + first);
 }
@@ -78,7 +74,7 @@ static bool take_integer(PyObject *action, PyTurn *t) {
 /* Takes an array of actions, or the action of the only environment: an array, or an integer. */
 static bool take_actions(PyObject *actions, PyTurn *t) {
     const bool is_discrete = t->turn.play->actions.check == ACTIONS_IN_RANGE;
-    const bool good = is_discrete && is_of_one(t->playing) && !PySequence_Check(actions)
+    const bool good = is_discrete && t->playing->results.are_of_one && !PySequence_Check(actions)
                           ? take_integer(actions, t)
                           : take_array(t->playing, actions, &t->actions);
 
@@ -160,7 +156,7 @@ static void settle_results(const ResultArrays *arrays, PyTurn *t) {
 }
 
 static char *memory_of(const PyTurn *t, const ResultArrays *arrays, size_t other) {
-    return arrays->memory[results_place(t->playing->results, other)];
+    return arrays->memory[results_place(&t->playing->results, other)];
 }
 
 /* Lets episodes start where others have ended before this step, and at_ends also where others end in
@@ -181,13 +177,13 @@ static PyObject *result_of(const PyTurn *t, const ResultArrays *arrays) {
     const bool at_ends = t->turn.started != NULL;
     const bool any_started = at_ends ? t->ends.started > 0 : t->turn.drawn != NULL;
 
-    return results_of_step(t->playing->results, arrays, t->troubled,
+    return results_of_step(&t->playing->results, arrays, t->troubled,
                            t->ends.ended > t->ends.started, any_started, at_ends);
 }
 
 static PyObject *step_with(PyPool *self, int operation, Work *work, bool at_ends, PyTurn *t) {
     const Play *play = t->turn.play;
-    Results *results = t->playing->results;
+    Results *results = &t->playing->results;
     const bool starts =
         operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
     ResultArrays arrays;
@@ -201,7 +197,7 @@ static PyObject *step_with(PyPool *self, int operation, Work *work, bool at_ends
         }
         result = play_turn(self, operation, work, t) ? result_of(t, &arrays) : NULL;
     }
-    results_drop(results, &arrays);
+    results_release(results, &arrays);
     return result;
 }
 
@@ -242,7 +238,7 @@ PyObject *py_play_after(PyObject *object, PyObject *unused) {
 
 /* The memory is provided first: that may run code that changes the caller's mask. */
 static PyObject *start_with(PyPool *self, PyObject *mask, PyTurn *t) {
-    Results *results = t->playing->results;
+    Results *results = &t->playing->results;
     ResultArrays arrays;
     PyObject *result = NULL;
 
@@ -258,7 +254,7 @@ static PyObject *start_with(PyPool *self, PyObject *mask, PyTurn *t) {
                          : NULL;
         }
     }
-    results_drop(results, &arrays);
+    results_release(results, &arrays);
     return result;
 }
 

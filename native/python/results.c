@@ -2,16 +2,7 @@
 
 #include "python/results.h"
 
-#include <stdlib.h>
 #include <string.h>
-
-#include "python/reused_arrays.h"
-
-struct Results {
-    bool are_of_one;
-    size_t number_of_seen;
-    Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
-};
 
 /* Taking over */
 
@@ -33,53 +24,28 @@ static bool take_makers(Results *r, PyObject *shapes) {
     return true;
 }
 
-Results *results_take(PyObject *parts) {
+bool results_take(Results *r, PyObject *parts) {
     int are_of_one;
     PyObject *shapes;
-    Results *r = calloc(1, sizeof *r);
 
-    if (r == NULL) {
-        PyErr_NoMemory();
-        return NULL;
-    }
     if (!PyTuple_Check(parts)) {
         PyErr_SetString(PyExc_TypeError, "expected a tuple of results");
-    } else if (PyArg_ParseTuple(parts, "pO!;results", &are_of_one, &PyTuple_Type, &shapes) &&
-               numpy_import() && take_makers(r, shapes)) {
-        r->are_of_one = are_of_one != 0;
-        return r;
+        return false;
     }
-    results_free(r);
-    return NULL;
+    if (!PyArg_ParseTuple(parts, "pO!;results", &are_of_one, &PyTuple_Type, &shapes)) {
+        return false;
+    }
+    r->are_of_one = are_of_one != 0;
+    return numpy_import() && take_makers(r, shapes);
 }
 
-void results_free(Results *r) {
-    if (r == NULL) {
-        return;
-    }
+void results_drop(Results *r) {
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
         maker_drop(&r->makers[i]);
     }
-    for (size_t i = 0; i < r->number_of_seen; i++) {
+    for (size_t i = 0; i < MOST_SEEN; i++) {
         maker_drop(&r->last[i]);
     }
-    free(r);
-}
-
-bool results_are_of_one(const Results *r) {
-    return r->are_of_one;
-}
-
-size_t results_number_of_seen(const Results *r) {
-    return r->number_of_seen;
-}
-
-size_t results_place(const Results *r, size_t other) {
-    return r->number_of_seen + other;
-}
-
-size_t results_size(const Results *r, size_t array) {
-    return r->makers[array].size;
 }
 
 /* Providing */
@@ -129,7 +95,7 @@ bool results_provide_reset(Results *r, ResultArrays *a) {
     return provide_some(r, 0, r->number_of_seen, a) && provide_others(r, a);
 }
 
-void results_drop(const Results *r, ResultArrays *a) {
+void results_release(const Results *r, ResultArrays *a) {
     for (size_t i = 0; i < results_place(r, OTHER_ARRAYS); i++) {
         Py_XDECREF(a->arrays[i]);
     }

@@ -4,14 +4,18 @@
 #define FMUGYM_RESULTS_H
 
 #include "pool/play.h"
-#include "python/python.h"
+#include "python/reused_arrays.h"
 
 /* After the arrays of observations and infos come those that only a step has (pool/play.h), then those
  * that only starts of episodes have. */
 enum { MASK_ARRAY = STEP_ARRAYS, DRAWN_ARRAY, OTHER_ARRAYS };
 enum { MOST_SEEN = MOST_ARRAYS - STEP_ARRAYS, RESULT_ARRAYS = MOST_SEEN + OTHER_ARRAYS };
 
-typedef struct Results Results;
+typedef struct {
+    bool are_of_one; /* whether a number stands in the place of an array of one */
+    size_t number_of_seen; /* arrays of observations and infos */
+    Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
+} Results;
 
 /* The arrays of one step or reset, and their memory. If episodes start where others end, there are
  * more of observations and infos, for the last ones. */
@@ -20,29 +24,26 @@ typedef struct {
     char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
 } ResultArrays;
 
-/* Takes a tuple: whether results are those of a single environment, with numbers in the place of arrays
- * of one; and the shape and type of each array: those of observations and infos, then rewards,
- * terminated, truncated, mask and drawn values. Returns NULL with an exception if it does not fit. */
-Results *results_take(PyObject *parts);
-void results_free(Results *results);
+/* Takes a tuple: whether results are those of a single environment; and the shape and type of each array:
+ * those of observations and infos, then rewards, terminated, truncated, mask and drawn values. Returns
+ * false with an exception if it does not fit. The results must be dropped in any case. */
+bool results_take(Results *results, PyObject *parts);
+void results_drop(Results *results);
 
-/* Whether they are of a single environment. */
-bool results_are_of_one(const Results *results);
-size_t results_number_of_seen(const Results *results);
 /* The place of one of the other arrays. */
-size_t results_place(const Results *results, size_t other);
-/* The bytes of an array. */
-size_t results_size(const Results *results, size_t array);
+static inline size_t results_place(const Results *results, size_t other) {
+    return results->number_of_seen + other;
+}
 
 /* Provides the arrays of a step or of a reset: new ones, or ones of an earlier call that nobody but
- * the results holds any more. Returns false with an exception if memory runs out. The caller drops
+ * the results holds any more. Returns false with an exception if memory runs out. The caller releases
  * them in any case. */
 bool results_provide_step(Results *results, ResultArrays *arrays);
 bool results_provide_reset(Results *results, ResultArrays *arrays);
 /* After results_provide_step: provides the mask and the drawn values of episodes that start. With at_ends
  * also the arrays of last observations and infos, filled with NaN or zeros. */
 bool results_provide_starts(Results *results, bool at_ends, ResultArrays *arrays);
-void results_drop(const Results *results, ResultArrays *arrays);
+void results_release(const Results *results, ResultArrays *arrays);
 
 /* Copies a mask to the array of the mask. Returns false if it is no array that this can be done
  * with, or has no true element. */
