@@ -4,7 +4,7 @@ Arrays may be anything with a buffer: float64 for values, bool for masks, float3
 int8 for statuses. Those that are only read may have any strides.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final, final
 
 import numpy.typing as npt
@@ -206,18 +206,15 @@ class Pool:
     def count_steps(self) -> None:
         """Add the steps so far to the counts."""
 
-    def ask(
-        self, request: int, content: bytes, states: Sequence[bytes] = ..., /
-    ) -> tuple[int, Any]:
+    def ask(self, request: int, content: bytes, /) -> tuple[int, bytes]:
         """Ask for something else; see ``fmugym.pool.engine``.
 
         Args:
             request: What for.
-            content: The content of the request; without the states to restore.
-            states: These, if there are any.
+            content: The content of the request.
 
         Returns:
-            The code and the content of the answer; the states that were saved as a tuple.
+            The code and the content of the answer.
 
         Raises:
             ValueError: If there is no such request.

@@ -29,11 +29,11 @@ from fmugym.fmi.fmu import FMU, copy_libraries, extracted_again
 from fmugym.fmi.variable import Variable
 from fmugym.pool.c_extension import require_refusal
 from fmugym.pool.engine import (
-    Answer,
     Answers,
     EnginePool,
     Reader,
     Request,
+    read_states,
     request_restore,
     request_save,
 )
@@ -209,10 +209,8 @@ class NativePool(EnginePool):
             self._ask_pool(request, content(slice(0, count)), lambda reader: read(reader, count))
         ]
 
-    def _ask_pool(
-        self, request: Request, content: bytes, read: Callable[[Reader], R], *states: Any
-    ) -> R:
-        code, answer = self._open_pool().ask(request, content, *states)
+    def _ask_pool(self, request: Request, content: bytes, read: Callable[[Reader], R]) -> R:
+        code, answer = self._open_pool().ask(request, content)
         found: R | SimulationError = self._answers.result(code, Reader(answer), read)
         if isinstance(found, SimulationError):
             raise found
@@ -220,15 +218,14 @@ class NativePool(EnginePool):
 
     def save_states(self, indices: IndexArray, records: bool) -> Sequence[bytes]:
         """See ``SavingPool.save_states``."""
-        code, answer = self._open_pool().ask(Request.SAVE, request_save(indices, records))
-        if code == Answer.RESULT:
-            states: tuple[bytes, ...] = answer
-            return states
-        raise self._answers.result(code, Reader(answer), Reader.end)
+        outputs, content = len(self.outputs), request_save(indices, records)
+        return self._ask_pool(
+            Request.SAVE, content, lambda reader: read_states(reader, len(indices), outputs)
+        )
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
-        """See ``SavingPool.restore_states``; the states are not copied."""
-        self._ask_pool(Request.RESTORE, request_restore((), indices), Reader.end, states)
+        """See ``SavingPool.restore_states``."""
+        self._ask_pool(Request.RESTORE, request_restore(states, indices), Reader.end)
 
     def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
         """See ``SavingPool._restore_snapshot``."""

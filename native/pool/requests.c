@@ -199,19 +199,6 @@ static Answer restore_snapshot(Asked *a, int64_t number, const int64_t *indices,
     return restore(a, indices, NULL, snapshot, count);
 }
 
-Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
-                           size_t count) {
-    Asked asked = {.pool = pool, .reader = reader, .writer = writer};
-    size_t wanted;
-    const int64_t *indices = read_instances(&asked, &wanted);
-
-    read_integer_in(reader, NO_SNAPSHOT, NO_SNAPSHOT);
-    if (wanted != count) {
-        reader_refuse(reader, "the states differ in number");
-    }
-    return restore(&asked, indices, states, NULL, count);
-}
-
 static Answer answer_restore(Asked *a) {
     size_t count;
     const int64_t *indices = read_instances(a, &count);
@@ -229,6 +216,7 @@ static Answer answer_restore(Asked *a) {
         const Block block = read_block(a->reader);
         states[i] = (State){block.bytes, block.size};
     }
+    reader_require(a->reader, a->reader->at == a->reader->end, "the states differ in number");
     const Answer result = restore(a, indices, states, NULL, count);
     free(states);
     return result;

@@ -36,10 +36,6 @@ typedef enum {
  * a worker answers. The inputs are those of derivatives. */
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer);
 
-/* The same for a request to restore states that the owner has at hand. */
-Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
-                           size_t count);
-
 /* The answer to a request that is refused. */
 Answer answer_refusal(Writer *writer, const char *why);
 /* The answer where the instances have done what was asked, unless the request was damaged, or one of them

@@ -92,9 +92,6 @@ typedef struct {
     Request request;
     Reader reader;
     Writer writer;
-    PyObject *held; /* a tuple of the states to restore, or NULL */
-    State *states;
-    size_t number_of_states;
     Answer answer;
 } Asking;
 
@@ -102,94 +99,37 @@ static void do_ask(PyPool *self, bool alone, void *context) {
     Asking *a = context;
 
     (void)alone;
-    a->answer = a->held == NULL
-                    ? pool_answer(&self->pool, matrix_of(&self->buffers[INPUTS]), a->request,
-                                  &a->reader, &a->writer)
-                    : pool_answer_restore(&self->pool, &a->reader, &a->writer, a->states,
-                                          a->number_of_states);
-}
-
-/* Takes a sequence of bytes, which is neither copied nor changed. */
-static bool take_states(PyObject *sequence, Asking *a) {
-    a->held = PySequence_Tuple(sequence);
-    if (a->held == NULL) {
-        return false;
-    }
-    a->number_of_states = (size_t)PyTuple_Size(a->held);
-    a->states = calloc(a->number_of_states + 1, sizeof *a->states);
-    if (a->states == NULL) {
-        PyErr_NoMemory();
-        return false;
-    }
-    for (size_t i = 0; i < a->number_of_states; i++) {
-        char *bytes;
-        Py_ssize_t size;
-        if (PyBytes_AsStringAndSize(PyTuple_GetItem(a->held, (Py_ssize_t)i), &bytes, &size) < 0) {
-            return false;
-        }
-        a->states[i] = (State){bytes, (size_t)size};
-    }
-    return true;
-}
-
-/* A tuple of the blocks that are all that was written. */
-static PyObject *blocks_of(const Writer *writer) {
-    Reader reader = {writer->bytes, writer->bytes + writer->size, NULL}, ahead = reader;
-    Py_ssize_t count = 0;
-
-    for (; ahead.at != ahead.end; count++) {
-        read_block(&ahead);
-    }
-    PyObject *blocks = PyTuple_New(count);
-    for (Py_ssize_t i = 0; blocks != NULL && i < count; i++) {
-        const Block block = read_block(&reader);
-        PyObject *bytes = PyBytes_FromStringAndSize(block.bytes, (Py_ssize_t)block.size);
-        if (bytes == NULL || PyTuple_SetItem(blocks, i, bytes) < 0) {
-            Py_CLEAR(blocks);
-        }
-    }
-    return blocks;
+    a->answer = pool_answer(&self->pool, matrix_of(&self->buffers[INPUTS]), a->request, &a->reader,
+                            &a->writer);
 }
 
 static PyObject *answer_of(const Asking *a) {
     const Writer *writer = &a->writer;
     const char *bytes = writer->bytes == NULL ? "" : writer->bytes;
 
-    if (writer->failed) {
-        return PyErr_NoMemory();
-    }
-    return a->request == REQUEST_SAVE && a->answer == ANSWER_RESULT
-               ? Py_BuildValue("iN", (int)a->answer, blocks_of(writer))
-               : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
+    return writer->failed ? PyErr_NoMemory()
+                          : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }
 
-static PyObject *ask(PyPool *self, Asking *a, PyObject *states) {
-    if ((states != NULL && !take_states(states, a)) ||
-        !perform(self, NO_OPERATION, do_ask, a) || !report_messages(self)) {
-        return NULL;
-    }
-    return answer_of(a);
-}
-
-/* Takes a request, its form, and maybe the states to restore. The memory of bytes is aligned. */
+/* Takes a request and its form. The memory of bytes is aligned. */
 PyObject *py_ask(PyObject *object, PyObject *args) {
-    Asking a = {.held = NULL};
+    PyPool *self = (PyPool *)object;
+    Asking a = {.answer = ANSWER_ERROR};
     int request;
-    PyObject *form, *states = NULL;
+    PyObject *form;
 
-    if (!PyArg_ParseTuple(args, "iS|O:ask", &request, &form, &states)) {
+    if (!PyArg_ParseTuple(args, "iS:ask", &request, &form)) {
         return NULL;
     }
     if (request < 0 || request >= REQUESTS) {
         PyErr_Format(PyExc_ValueError, "there is no request %d", request);
         return NULL;
     }
-    a.request = (Request)request;
     const char *bytes = PyBytes_AsString(form);
+    a.request = (Request)request;
     a.reader = (Reader){bytes, bytes + PyBytes_Size(form), NULL};
-    PyObject *result = ask((PyPool *)object, &a, states);
+    PyObject *result =
+        perform(self, NO_OPERATION, do_ask, &a) && report_messages(self) ? answer_of(&a) : NULL;
     free(a.writer.bytes);
-    free(a.states);
-    Py_XDECREF(a.held);
     return result;
 }

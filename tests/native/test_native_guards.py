@@ -175,7 +175,7 @@ class TestStates:
                 with pytest.raises(SimulationError, match="damaged"):
                     pool.restore_states([state[:size]], np.zeros(1, np.int64))
         pool.restore_states([state], np.zeros(1, np.int64))
-        assert pool.save_states(np.zeros(1, np.int64), records) == (state,)
+        assert pool.save_states(np.zeros(1, np.int64), records) == [state]
 
     @pytest.mark.parametrize(
         "head",
