@@ -227,9 +227,11 @@ def request_save(
 def request_restore(
     states: Sequence[bytes], indices: IndexArray, snapshot: int = NO_SNAPSHOT
 ) -> bytes:
-    """Restore states, or a snapshot."""
+    """Restore states, or a snapshot. A state that several instances get is there once."""
+    places = {state: place for place, state in enumerate(dict.fromkeys(states))}
     writer = Writer().array(indices, np.int64).integers(snapshot)
-    for state in states:
+    writer.array([places[state] for state in states], np.int64)
+    for state in places:
         writer.block(state)
     return writer.form()
 

@@ -199,6 +199,35 @@ static Answer restore_snapshot(Asked *a, int64_t number, const int64_t *indices,
     return restore(a, indices, NULL, snapshot, count);
 }
 
+/* Reads states until the form ends, at most so many. Returns their number. */
+static size_t read_states(Reader *reader, State *states, size_t most) {
+    size_t number = 0;
+
+    while (number < most && reader->fault == NULL && reader->at != reader->end) {
+        const Block block = read_block(reader);
+        states[number++] = (State){block.bytes, block.size};
+    }
+    reader_require(reader, reader->at == reader->end, "the states differ in number");
+    return number;
+}
+
+/* Sets the state of each of so many instances. */
+static void find_states(Reader *reader, State *states, size_t count) {
+    size_t number;
+    const int64_t *places = read_array(reader, sizeof *places, &number);
+    State *distinct = reader_room(reader, count, sizeof *distinct);
+
+    reader_require(reader, number == count, "the states differ in number");
+    const uint64_t found = reader->fault == NULL ? read_states(reader, distinct, count) : 0;
+    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
+        const uint64_t place = (uint64_t)places[i];
+        if (reader_require(reader, place < found, "there is no such state")) {
+            states[i] = distinct[place];
+        }
+    }
+    free(distinct);
+}
+
 static Answer answer_restore(Asked *a) {
     size_t count;
     const int64_t *indices = read_instances(a, &count);
@@ -207,16 +236,10 @@ static Answer answer_restore(Asked *a) {
     if (number != NO_SNAPSHOT) {
         return restore_snapshot(a, number, indices, count);
     }
-    State *states = calloc(count + 1, sizeof *states);
-
-    if (states == NULL) {
-        reader_refuse(a->reader, "out of memory");
+    State *states = reader_room(a->reader, count, sizeof *states);
+    if (a->reader->fault == NULL) {
+        find_states(a->reader, states, count);
     }
-    for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
-        const Block block = read_block(a->reader);
-        states[i] = (State){block.bytes, block.size};
-    }
-    reader_require(a->reader, a->reader->at == a->reader->end, "the states differ in number");
     const Answer result = restore(a, indices, states, NULL, count);
     free(states);
     return result;
