@@ -241,6 +241,14 @@ def check_flag(what: str, value: Any) -> bool:
     return bool(number)
 
 
+def items_of(value: Any) -> list[Any]:
+    """Items of a list, a tuple or an array; none of anything else, or if its own methods fail."""
+    try:
+        return list(value) if isinstance(value, list | tuple | np.ndarray) else []
+    except Exception:  # the object's own method fails, or the array has no axis
+        return []
+
+
 def has_method(value: object, name: str) -> bool:
     """Whether a value has a method of this name; no, if asking it raises an error."""
     try:

@@ -9,7 +9,7 @@ from typing import Any, Final, TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fmugym.checks import check_integer, check_number
+from fmugym.checks import check_integer, check_number, items_of
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering._pygame import pygame
 
@@ -283,9 +283,10 @@ def checked_size(size: Any) -> tuple[int, int]:
     Raises:
         ConfigError: If the size is not a pair of positive integers, or is too large.
     """
-    if not isinstance(size, tuple | list) or len(size) != 2:
+    sides = items_of(size)
+    if len(sides) != 2:
         raise ConfigError(f"size must be a width and a height, not {shown(size)}")
-    width, height = (check_integer("width and height", side, 1, 2**15) for side in size)
+    width, height = (check_integer("width and height", side, 1, 2**15) for side in sides)
     if width * height * _SUPERSAMPLING**2 > _MOST_PIXELS:
         raise ConfigError(f"a picture of {width} x {height} pixels is too large")
     return width, height

@@ -3,6 +3,7 @@
 import contextlib
 import copy
 import datetime
+import re
 from pathlib import Path
 
 import numpy as np
@@ -210,6 +211,8 @@ def as_file(task):
     try:
         text = tomlkit.dumps(task)
     except Exception:  # of any kind
+        return task
+    if re.search(r"\d{1000}", text):
         return task
     file.write_text(text, encoding="utf-8", errors="replace")
     return file

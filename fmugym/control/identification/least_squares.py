@@ -9,12 +9,13 @@ number of trajectories. The statistics are information, covariances and correlat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan
+from fmugym.checks import Spellings, by_own_names, check_number, float_or_nan, items_of
 from fmugym.control.identification.simulator import FitSettings, Simulator
 from fmugym.control.identification.trajectory import Comparison, Trajectory, common_names
 from fmugym.environment.fmu_variables import start_variable
@@ -109,10 +110,10 @@ def memory_of(correlation: float, count: int) -> int:
     Econometrica 59 (1991).
 
     Args:
-        correlation: Between neighbouring samples.
+        correlation: Between neighbouring samples; NaN, which is not known, counts as the largest.
         count: The number of samples.
     """
-    slow = min(max(correlation, 0.0), 0.99)
+    slow = 0.99 if math.isnan(correlation) else min(max(correlation, 0.0), 0.99)
     return 1 + int(1.1447 * (4 * slow**2 / (1 - slow**2) ** 2 * count) ** (1 / 3))
 
 
@@ -489,11 +490,8 @@ def _levenberg_marquardt(
 
 def _limits(variable: Variable, limits: ParameterLimits) -> tuple[float, float, float]:
     """Return start value, lower and upper bound of a parameter."""
-    entries = limits if isinstance(limits, tuple | list | np.ndarray) else (limits,)
-    try:
-        numbers = tuple(float_or_nan(entry) for entry in entries)
-    except Exception:  # the object's own method fails
-        numbers = ()
+    is_one = not isinstance(limits, tuple | list | np.ndarray)
+    numbers = tuple(map(float_or_nan, [limits] if is_one else items_of(limits)))
     if len(numbers) == 1:
         numbers = (*numbers, variable.minimum, variable.maximum)
     elif len(numbers) == 2:
