@@ -150,7 +150,7 @@ def odd_hook(name, base, distort, first, in_variable):
         if next(calls) < first:
             return value
         if in_variable:
-            self.variables["sum"] = distort(self.variables["sum"])
+            self.variables["sum"] = distort(self.state[0])  # its own value would grow without end
             return value
         return distort(value)
 

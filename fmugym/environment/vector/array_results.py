@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.checks import check_mapping, number_of
+from fmugym.checks import check_mapping, items_of, number_of
 from fmugym.environment.env import FMUEnv
 from fmugym.environment.episode import environments_first
 from fmugym.environment.episode_start import EpisodeStart
@@ -77,7 +77,7 @@ def write_inputs(value: Any, inputs: FloatArray) -> None:
     given(value, "_get_inputs")
     wanted = f"{length} numbers, or arrays of {count}"
     is_list = issubclass(type(value), list | tuple)
-    rows = value if is_list else _rows_of(value, length, wanted)
+    rows = items_of(value) if is_list else _rows_of(value, length, wanted)
     if len(rows) != length:
         raise ConfigError(f"_get_inputs returned {len(rows)} values, expected {length}")
     for row, part in zip(inputs, rows, strict=True):
