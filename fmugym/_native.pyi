@@ -1,11 +1,11 @@
 """Pools of FMU instances in C; ``fmugym.pool.native_pool`` is the way to use them.
 
-Arrays may be anything with a buffer: float64 for values, bool for masks, float32 for observations,
-int8 for statuses. Those that are only read may have any strides.
+Arrays are those of numpy: float64 for values, bool for masks, float32 for observations, int8 for
+statuses. Masks and the values of a reset may have any strides.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, final
+from typing import Any, Final, NewType, final
 
 import numpy.typing as npt
 
@@ -72,9 +72,11 @@ def stop_tracing(process: int, stopped_by: int, /) -> None:
         stopped_by: The number of the signal, which it gets now.
     """
 
-@final
-class Access:
-    """A list of variables of one FMI version.
+Access = NewType("Access", object)
+"""A list of variables of one FMI version; nothing but pools can read it."""
+
+def access(form: bytes, /) -> Access:
+    """Take over a list of variables.
 
     Args:
         form: See ``fmugym.pool.pool_form.form_of_listing``.
@@ -83,40 +85,34 @@ class Access:
         ValueError: If the form is damaged.
     """
 
-    def __new__(cls, form: bytes, /) -> Access: ...
+Draws = tuple[bytes, int, int]
+"""The draws of an episode: their form, see ``fmugym.pool.pool_form.form_of_draws``, and the
+addresses of numpy's ``random_standard_normal`` and of ``exp`` behind ``math.exp``, or 0."""
 
-@final
-class Draws:
-    """The draws of an episode.
+def draw(draws: Draws, streams: Array, values: Array, /) -> None:
+    """Draw an episode from each of M streams; ``given`` values stay.
 
     Args:
-        form: See ``fmugym.pool.pool_form.form_of_draws``.
-        standard_normal: The address of numpy's ``random_standard_normal``, or 0.
-        exponential: The address of the function ``exp`` behind ``math.exp``, or 0.
+        draws: The draws.
+        streams: They change, uint64, shape (M, 6).
+        values: Filled, float64, shape (draws, M).
 
     Raises:
         ValueError: If a kind is unknown or does not have the numbers that it needs.
     """
 
-    def __new__(cls, form: bytes, standard_normal: int, exponential: int = ..., /) -> Draws: ...
-    def take(self, streams: Array, values: Array, /) -> None:
-        """Draw an episode from each of M streams; ``given`` values stay.
+def draw_from(draws: Draws, bits: object, start_values: Array, values: Array, /) -> None:
+    """Draw an episode by a bit generator of numpy.
 
-        Args:
-            streams: They change, uint64, shape (M, 6).
-            values: Filled, float64, shape (draws, M).
-        """
+    Args:
+        draws: The draws.
+        bits: The ``capsule`` of the generator; the caller holds its ``lock``.
+        start_values: Gets those that are drawn, float64, shape (P,).
+        values: Filled, float64, shape (draws,).
 
-    def take_from(self, bits: object, start_values: Array, /) -> list[float]:
-        """Draw an episode by a bit generator of numpy.
-
-        Args:
-            bits: Its ``capsule``; the caller holds its ``lock``.
-            start_values: Gets those that are drawn, float64, shape (P,).
-
-        Returns:
-            The values in the order of the draws.
-        """
+    Raises:
+        ValueError: As for ``draw``.
+    """
 
 @final
 class Pool:
@@ -159,7 +155,6 @@ class Pool:
 
     def prepare_play(
         self,
-        *,
         form: bytes,
         rows: tuple[Array, ...],
         start: Access,
@@ -170,7 +165,8 @@ class Pool:
         streams: Array,
         ended: Array,
         kept: Array,
-        results: tuple[Any, ...],
+        results: tuple[bool, tuple[Array, ...]],
+        /,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 

@@ -9,7 +9,7 @@ import ctypes
 import functools
 import math
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property, partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -63,7 +63,7 @@ def _draws(recipes: tuple[Recipe, ...], rows: tuple[int, ...]) -> Draws:
     columns = [known.index(recipe.kind) for recipe in recipes], rows, firsts, counts
     table = np.array(columns, np.int64).reshape(4, -1).T
     numbers = np.array([number for recipe in recipes for number in recipe.numbers])
-    return _native.Draws(form_of_draws(table, numbers), _standard_normal(), _exponential())
+    return form_of_draws(table, numbers), _standard_normal(), _exponential()
 
 
 @functools.cache
@@ -176,7 +176,8 @@ class EpisodeStart:
             own = [episode_variables[name]] if array is None else array.distributions
             self._distributions.extend(own)
         self._start_values = self.constants.reshape(-1, 1).copy()
-        self._starts: Any = self._start_values.reshape(-1).data  # faster to write to
+        self._row = self._start_values.reshape(-1)
+        self._starts: Any = self._row.data  # faster to write to
 
     @cached_property
     def parameter_names(self) -> list[str]:
@@ -206,6 +207,19 @@ class EpisodeStart:
     def native(self) -> Draws | None:
         """The draws for the C extension; None if only Python can make them."""
         return native_draws(self.recipes, self.drawn_rows)
+
+    @cached_property
+    def _draw_natively(self) -> Callable[[object, FloatArray, FloatArray], None]:
+        """``_native.draw_from`` with the draws."""
+        from fmugym import _native
+
+        assert self.native is not None
+        return partial(_native.draw_from, self.native)
+
+    @cached_property
+    def _drawn(self) -> FloatArray:
+        """Memory for the drawn values of an episode."""
+        return np.empty(len(self.drawn))
 
     def named(self, values: Sequence[Any] | FloatArray) -> dict[str, Any]:
         """The drawn values of one episode, or of M, by name.
@@ -326,7 +340,9 @@ class EpisodeStart:
             return values
         bits = rng.bit_generator
         with bits.lock:
-            return self.native.take_from(bits.capsule, self._starts)
+            self._draw_natively(bits.capsule, self._row, self._drawn)
+        values: list[float] = self._drawn.tolist()
+        return values
 
     def _drawn_by(self, rng: np.random.Generator) -> list[float]:
         values = draw_all(self._distributions, rng)

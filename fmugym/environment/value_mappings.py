@@ -223,15 +223,11 @@ class LateDict(dict[str, Any]):
     Every method of ``dict`` fills it first. C functions that read a dict without calling its
     methods would find ``UNFILLED``; no function of the standard library does that.
 
-    Args:
-        pending: A function that returns the items, and its arguments. Until they are asked for,
-            they are kept under ``UNFILLED``, because ``json`` believes an empty dict at once.
+    It is made of a dict whose only key is ``UNFILLED``, because ``json`` believes an empty one at
+    once. The value is a tuple: a function that returns the items, and its arguments.
     """
 
     __slots__ = ()
-
-    def __init__(self, *pending: Any) -> None:
-        dict.__setitem__(self, UNFILLED, pending)
 
     def _filled(self) -> dict[str, Any]:
         pending = dict.pop(self, UNFILLED, None)

@@ -161,7 +161,7 @@ class NativePool(EnginePool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             manner = manner_of(self._fmu.description)
-            access = _native.Access(form_of_listing(variables, self._version, manner))
+            access = _native.access(form_of_listing(variables, self._version, manner))
             self._accesses[variables] = access
         return access
 
@@ -334,21 +334,22 @@ def prepare(
             what they hold at the start of an episode, in this order, see ``RowStart``;
             ``unstepped``, the same for what the second program stores where an episode starts
             instead of a step; ``results``, whether to return numbers in the place of arrays of
-            one; and the shape and type of each array: ``seen`` of observations and infos, which
-            the pool fills with float32 if no program does, then rewards, terminated and truncated
-            of a step, mask and drawn values (draws, N) of a reset.
+            one; and for each array one of its shape and type: ``seen`` of observations and infos,
+            which the pool fills with float32 if no program does, then rewards, terminated and
+            truncated of a step, mask and drawn values (draws, N) of a reset.
     """
     rows = Rows()
     pool.prepare_play(
-        form=form_of_play(rows, programs, actions, surroundings),
-        rows=tuple(rows.arrays),
-        start=start,
-        start_values=start_values,
-        draws=draws[0],
-        streams=draws[1],
-        ended=ended,
-        **{name: actions[name] for name in ("current", "previous")},
-        **{name: surroundings[name] for name in ("kept", "results")},
+        form_of_play(rows, programs, actions, surroundings),
+        tuple(rows.arrays),
+        start,
+        start_values,
+        actions["current"],
+        actions["previous"],
+        *draws,
+        ended,
+        surroundings["kept"],
+        surroundings["results"],
     )
 
 
@@ -366,7 +367,7 @@ def _close(pool: _native.Pool, fmu: FMU) -> None:
 def play_around(pool: Pool, spec: PoolSpec, variables: tuple[Variable, ...], *parts: Any) -> Play:
     """Prepare programs that run before and after the steps of a pool; see ``Pool.prepare_play``."""
     programs = programs_for(pool, spec)
-    prepare(programs, _native.Access(form_of_listing(variables)), *parts)
+    prepare(programs, _native.access(form_of_listing(variables)), *parts)
     return Play(programs.check_actions, programs.play_before, programs.play_after)
 
 

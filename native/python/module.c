@@ -1,6 +1,6 @@
 /* The extension module fmugym._native. See fmugym/_native.pyi. */
 
-#include "python/programs.h"
+#include "python/python.h"
 
 #include "pool/threads.h"
 
@@ -34,7 +34,10 @@ static PyObject *initializations(PyObject *module, PyObject *unused) {
 }
 
 static PyMethodDef functions[] = {
+    {"access", py_access, METH_O, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
+    {"draw", py_draw, METH_VARARGS, NULL},
+    {"draw_from", py_draw_from, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},
@@ -50,11 +53,6 @@ static struct PyModuleDef definition = {
     .m_size = -1,
     .m_methods = functions,
 };
-
-static bool add_type(PyObject *module, PyTypeObject **type, PyType_Spec *spec) {
-    *type = (PyTypeObject *)PyType_FromSpec(spec);
-    return *type != NULL && PyModule_AddType(module, *type) == 0;
-}
 
 static bool add_names(PyObject *module, const char *name, const char *const *texts,
                       Py_ssize_t count) {
@@ -72,18 +70,14 @@ static bool add_constants(PyObject *module) {
 }
 
 PyMODINIT_FUNC PyInit__native(void) {
-    static PyTypeObject *pool_type;
     PyObject *module = PyModule_Create(&definition);
+    PyObject *pool_type = PyType_FromSpec(&pool_spec);
 
-    if (module == NULL) {
-        return NULL;
-    }
     pool_prepare_process();
-    if (!add_type(module, &access_type, &access_spec) ||
-        !add_type(module, &draws_type, &draws_spec) ||
-        !add_type(module, &pool_type, &pool_spec) || !add_constants(module)) {
-        Py_DECREF(module);
-        return NULL;
+    if (module == NULL || pool_type == NULL ||
+        PyModule_AddType(module, (PyTypeObject *)pool_type) < 0 || !add_constants(module)) {
+        Py_CLEAR(module);
     }
+    Py_XDECREF(pool_type);
     return module;
 }

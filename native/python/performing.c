@@ -5,23 +5,16 @@
 #include "pool/inside.h"
 #include "python/python.h"
 
-/* A new reference to an object of a module, or NULL with an exception. */
-static PyObject *find_object(const char *module_name, const char *name) {
-    PyObject *module = PyImport_ImportModule(module_name);
-    PyObject *found = module == NULL ? NULL : PyObject_GetAttrString(module, name);
-
-    Py_XDECREF(module);
-    return found;
-}
-
 /* The package is not imported before: workers do without it. */
 static void raise_closed(void) {
-    PyObject *type = find_object("fmugym.errors", "SimulationError");
+    PyObject *module = PyImport_ImportModule("fmugym.errors");
+    PyObject *type = module == NULL ? NULL : PyObject_GetAttrString(module, "SimulationError");
 
     if (type != NULL) {
         PyErr_SetString(type, "the pool is closed");
-        Py_DECREF(type);
     }
+    Py_XDECREF(type);
+    Py_XDECREF(module);
 }
 
 bool require_arguments(Py_ssize_t given, Py_ssize_t expected) {

@@ -12,20 +12,14 @@ Playing *playing_of(PyObject *capsule) {
     return PyCapsule_GetPointer(capsule, PLAYING);
 }
 
-static void playing_free(Playing *playing) {
-    for (int i = 0; i < PLAY_BUFFERS; i++) {
-        release_buffer(&playing->buffers[i]);
-    }
-    play_drop(&playing->form);
-    release_rows(&playing->rows);
-    Py_XDECREF(playing->start);
-    Py_XDECREF(playing->draws);
-    results_drop(&playing->results);
-    free(playing);
-}
+static void free_playing(PyObject *capsule) {
+    Playing *playing = playing_of(capsule);
 
-static void playing_dealloc(PyObject *capsule) {
-    playing_free(playing_of(capsule));
+    play_drop(&playing->form);
+    free(playing->rows);
+    results_drop(&playing->results);
+    Py_XDECREF(playing->args);
+    free(playing);
 }
 
 static void replace_reference(PyObject **place, PyObject *object) {
@@ -37,104 +31,89 @@ static void replace_reference(PyObject **place, PyObject *object) {
 
 /* Preparing */
 
-static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObject *values) {
-    if (!require_access(self, start)) {
-        return false;
-    }
-    Py_INCREF(start);
-    playing->start = start;
-    return take_matrix(values, &playing->buffers[STARTS], WRITTEN, "start_values", ITEM_FLOAT64,
-                       (Py_ssize_t)((PyAccess *)start)->access.count,
-                       (Py_ssize_t)self->pool.settings.count);
-}
-
-static bool take_draws(PyPool *self, Playing *playing, PyObject *draws, PyObject *streams) {
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-
-    if (!PyObject_TypeCheck(draws, draws_type)) {
-        PyErr_SetString(PyExc_TypeError, "expected Draws");
-        return false;
-    }
-    playing->draws = Py_NewRef(draws);
-    playing->form.play.draws = &((PyDraws *)draws)->draws;
-    return take_matrix(streams, &playing->buffers[STREAMS], WRITTEN, "streams", ITEM_UINT64, n,
-                       STREAM_NUMBERS);
-}
-
-/* The arguments of prepare_play. */
+/* The arguments of prepare_play; the form of draws comes with the addresses of two functions. */
 typedef struct {
-    const char *form;
-    Py_ssize_t size;
-    PyObject *rows, *start, *start_values, *current, *previous, *draws, *streams;
-    PyObject *ended, *kept, *results;
+    PyObject *form, *rows, *start, *draws, *patterns;
+    unsigned long long standard_normal, exponential;
+    int are_of_one;
+    PyArrayObject *start_values, *current, *previous, *streams, *ended, *kept;
 } Parts;
 
-static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
-    static char *names[] = {"form",     "rows",  "start",   "start_values", "current", "previous",
-                            "draws",    "streams", "ended", "kept",         "results", NULL};
+static bool parse(PyObject *args, Parts *p) {
+    return PyArg_ParseTuple(args, "SO!OOOO(SKK)OOO(pO!):prepare_play", &p->form, &PyTuple_Type,
+                            &p->rows, &p->start, &p->start_values, &p->current, &p->previous,
+                            &p->draws, &p->standard_normal, &p->exponential, &p->streams, &p->ended,
+                            &p->kept, &p->are_of_one, &PyTuple_Type, &p->patterns);
+}
 
-    return PyArg_ParseTupleAndKeywords(args, kwargs, "$y#O!OOOOOOOOO:prepare_play", names, &p->form,
-                                       &p->size, &PyTuple_Type, &p->rows, &p->start,
-                                       &p->start_values, &p->current, &p->previous, &p->draws,
-                                       &p->streams, &p->ended, &p->kept, &p->results);
+static bool take_starts(PyPool *self, Playing *playing, const Parts *p) {
+    const npy_intp n = (npy_intp)self->pool.settings.count;
+    const Access *start = require_access(self, p->start);
+
+    if (start == NULL ||
+        !require_matrix(p->start_values, "start values", NPY_DOUBLE, NPY_ARRAY_CARRAY,
+                        (npy_intp)start->count, n) ||
+        !take_draws(p->draws, p->standard_normal, p->exponential, &playing->draws) ||
+        !require_starts(&playing->draws, (npy_intp)start->count) ||
+        !require_matrix(p->streams, "streams", NPY_UINT64, NPY_ARRAY_CARRAY, n, STREAM_NUMBERS)) {
+        return false;
+    }
+    playing->start = start;
+    playing->start_values = matrix_of(p->start_values);
+    return true;
 }
 
 static bool take_form(PyPool *self, Playing *playing, const Parts *p) {
     const Settings *s = &self->pool.settings;
-    Play *play = &playing->form.play;
-    const size_t parameters = ((PyAccess *)playing->start)->access.count;
 
-    play->start_values = playing->buffers[STARTS].buf;
-    if (!take_rows(p->rows, (Py_ssize_t)s->count, &playing->rows)) {
-        return false;
-    }
-    const char *fault = play_take(&playing->form, s, p->form, (size_t)p->size, playing->rows.rows,
-                                  playing->rows.count);
-    if (fault == NULL && !draws_fit(play->draws, parameters)) {
-        fault = "a draw is for no start value";
-    }
-    if (fault != NULL) {
-        PyErr_Format(PyExc_ValueError, "the form of a play is damaged: %s", fault);
-    }
-    return fault == NULL;
+    playing->rows = take_rows(p->rows, (npy_intp)s->count);
+    playing->form.play.draws = &playing->draws;
+    return playing->rows != NULL &&
+           require_no_fault("a play",
+                            play_take(&playing->form, s, PyBytes_AsString(p->form),
+                                      (size_t)PyBytes_Size(p->form), playing->rows,
+                                      (size_t)PyTuple_Size(p->rows)));
 }
 
 /* The actions of this step, of any type and with the environments on the first axis; those before alike. */
 static bool take_actions(PyPool *self, Playing *playing, const Parts *p) {
+    const npy_intp count = (npy_intp)self->pool.settings.count;
     Actions *a = &playing->form.play.actions;
-    Py_buffer *current = &playing->buffers[CURRENT], *previous = &playing->buffers[PREVIOUS];
-    const size_t count = self->pool.settings.count;
-    const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | PyBUF_WRITABLE;
+    PyArrayObject *current = p->current;
 
-    if (PyObject_GetBuffer(p->current, current, flags) < 0 ||
-        PyObject_GetBuffer(p->previous, previous, flags) < 0) {
+    if (!require_any_array(current, "actions")) {
         return false;
     }
-    playing->action_item = item_of(current);
-    if (playing->action_item == ITEMS || current->ndim == 0 ||
-        current->shape[0] != (Py_ssize_t)count || (size_t)current->itemsize != a->size ||
-        (size_t)current->len != count * a->elements * a->size) {
+    if (PyArray_NDIM(current) == 0 || PyArray_DIM(current, 0) != count ||
+        (size_t)PyArray_ITEMSIZE(current) != a->size ||
+        (size_t)PyArray_SIZE(current) != (size_t)count * a->elements ||
+        !PyArray_ISCARRAY(current)) {
         PyErr_SetString(PyExc_ValueError, "the memory for actions has another type or shape");
         return false;
     }
-    a->current = current->buf;
-    a->previous = previous->buf;
-    return buffer_fits(previous, WRITTEN, "previous actions", playing->action_item, current->ndim,
-                       current->shape);
+    if (!require_array(p->previous, "previous actions", PyArray_TYPE(current), NPY_ARRAY_CARRAY,
+                       PyArray_NDIM(current), PyArray_DIMS(current))) {
+        return false;
+    }
+    playing->actions = current;
+    a->current = PyArray_BYTES(current);
+    a->previous = PyArray_BYTES(p->previous);
+    return true;
 }
 
 static bool take_arrays(PyPool *self, Playing *playing, const Parts *p) {
     const Settings *s = &self->pool.settings;
-    const Py_ssize_t n = (Py_ssize_t)s->count;
-    Py_buffer *b = playing->buffers;
+    const npy_intp n = (npy_intp)s->count;
+    Play *play = &playing->form.play;
 
-    if (!take_vector(p->ended, &b[ENDED], WRITTEN, "ended", ITEM_BOOLEAN, n) ||
-        !take_matrix(p->kept, &b[KEPT], WRITTEN, "kept", ITEM_FLOAT64,
-                     (Py_ssize_t)s->outputs->count, n)) {
+    if (!require_vector(p->ended, "ended", NPY_BOOL, NPY_ARRAY_CARRAY, n) ||
+        !require_matrix(p->kept, "kept", NPY_DOUBLE, NPY_ARRAY_CARRAY,
+                        (npy_intp)s->outputs->count, n)) {
         return false;
     }
-    play_settle(&playing->form, s, b[KEPT].buf, b[ENDED].buf);
-    playing->form.play.streams = b[STREAMS].buf;
+    play_settle(&playing->form, s, PyArray_DATA(p->kept), PyArray_DATA(p->ended));
+    play->start_values = PyArray_DATA(p->start_values);
+    play->streams = PyArray_DATA(p->streams);
     return true;
 }
 
@@ -156,8 +135,8 @@ static bool results_fit(const PyPool *self, const Playing *playing) {
     return fit;
 }
 
-static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
-    if (!results_take(&playing->results, parts)) {
+static bool take_results(PyPool *self, Playing *playing, const Parts *p) {
+    if (!results_take(&playing->results, p->are_of_one != 0, p->patterns)) {
         return false;
     }
     if (!results_fit(self, playing)) {
@@ -168,28 +147,29 @@ static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
 }
 
 /* What comes later refers to what comes first. */
-static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
+static bool fill(PyPool *self, Playing *playing, PyObject *args) {
     Parts p;
 
-    return parse(args, kwargs, &p) && take_starts(self, playing, p.start, p.start_values) &&
-           take_draws(self, playing, p.draws, p.streams) && take_form(self, playing, &p) &&
+    playing->args = Py_NewRef(args);
+    return parse(args, &p) && take_starts(self, playing, &p) && take_form(self, playing, &p) &&
            take_actions(self, playing, &p) && take_arrays(self, playing, &p) &&
-           take_results(self, playing, p.results);
+           take_results(self, playing, &p);
 }
 
 /* Always discards the previous preparation. A call that uses it keeps its own reference. */
-PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
+PyObject *py_prepare_play(PyObject *object, PyObject *args) {
     PyPool *self = (PyPool *)object;
     Playing *playing = calloc(1, sizeof *playing);
+    PyObject *capsule = playing == NULL ? PyErr_NoMemory()
+                                        : PyCapsule_New(playing, PLAYING, free_playing);
 
     Py_CLEAR(self->playing);
-    if (playing == NULL) {
-        return PyErr_NoMemory();
-    }
-    PyObject *capsule =
-        fill(self, playing, args, kwargs) ? PyCapsule_New(playing, PLAYING, playing_dealloc) : NULL;
     if (capsule == NULL) {
-        playing_free(playing);
+        free(playing);
+        return NULL;
+    }
+    if (!fill(self, playing, args)) {
+        Py_DECREF(capsule);
         return NULL;
     }
     replace_reference(&self->playing, capsule);

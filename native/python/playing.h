@@ -5,27 +5,18 @@
 
 #include "pool/play_form.h"
 #include "pool/player.h"
-#include "python/programs.h"
+#include "python/python.h"
 #include "python/results.h"
-
-enum {
-    STARTS,
-    STREAMS,
-    ENDED,
-    CURRENT, /* the actions of a step, and of the one before */
-    PREVIOUS,
-    KEPT,
-    PLAY_BUFFERS
-};
 
 /* The result of prepare_play, which the next call replaces as a whole. */
 typedef struct {
+    PyObject *args; /* of prepare_play: all arrays and forms that the rest refers to */
     PlayForm form;
-    PyRows rows;
-    Py_buffer buffers[PLAY_BUFFERS];
-    Item action_item;
-    PyObject *start; /* the Access of the variables set before initialization */
-    PyObject *draws;
+    Row *rows;
+    Draws draws;
+    const Access *start; /* the variables set before initialization */
+    Matrix start_values;
+    PyArrayObject *actions; /* the memory for those of a step, whose type and shape actions have */
     Results results;
 } Playing;
 

@@ -5,40 +5,36 @@
 #include "pool/requests.h"
 #include "python/python.h"
 
-/* A call, its result, and the arrays of the caller. All others are the pool's own. */
+/* A call and its result. */
 typedef struct {
     int operation;
     Call call;
     size_t troubled;
-    Py_buffer mask, values;
 } PyCall;
 
-static Matrix matrix_of(const Py_buffer *buffer) {
-    return (Matrix){buffer->buf, buffer->strides[0], buffer->strides[1]};
-}
-
 static bool take_mask(PyPool *self, PyObject *object, PyCall *c) {
+    PyArrayObject *mask = (PyArrayObject *)object;
+
     if (object == Py_None) {
         return true;
     }
-    if (!take_vector(object, &c->mask, COPIED, "the mask", ITEM_BOOLEAN,
-                     (Py_ssize_t)self->pool.settings.count)) {
+    if (!require_vector(mask, "the mask", NPY_BOOL, 0, (npy_intp)self->pool.settings.count)) {
         return false;
     }
-    c->call.mask = (Mask){c->mask.buf, c->mask.strides[0]};
+    c->call.mask = (Mask){PyArray_BYTES(mask), PyArray_STRIDE(mask, 0)};
     return true;
 }
 
-static bool take_start(PyPool *self, PyObject *access, PyObject *values, PyCall *c) {
-    if (!require_access(self, access)) {
+static bool take_start(PyPool *self, PyObject *capsule, PyObject *object, PyCall *c) {
+    const Access *start = require_access(self, capsule);
+    PyArrayObject *values = (PyArrayObject *)object;
+
+    if (start == NULL || !require_matrix(values, "values", NPY_DOUBLE, 0, (npy_intp)start->count,
+                                         (npy_intp)self->pool.settings.count)) {
         return false;
     }
-    c->call.start = &((PyAccess *)access)->access;
-    if (!take_matrix(values, &c->values, COPIED, "values", ITEM_FLOAT64,
-                     (Py_ssize_t)c->call.start->count, (Py_ssize_t)self->pool.settings.count)) {
-        return false;
-    }
-    c->call.start_values = matrix_of(&c->values);
+    c->call.start = start;
+    c->call.start_values = matrix_of(values);
     return true;
 }
 
@@ -46,33 +42,32 @@ static void do_call(PyPool *self, bool alone, void *context) {
     PyCall *c = context;
 
     c->call.alone = alone;
-    c->call.inputs = matrix_of(&self->buffers[INPUTS]);
+    c->call.inputs = self->inputs;
     c->troubled = c->operation == STEP ? pool_step(&self->pool, &c->call)
                                        : pool_reset(&self->pool, &c->call);
 }
 
-static PyObject *make_call(PyPool *self, PyCall *c, bool good) {
-    const bool done = good && perform(self, c->operation, do_call, c);
-
-    release_buffer(&c->mask);
-    release_buffer(&c->values);
-    return done && report_messages(self) ? PyLong_FromSize_t(c->troubled) : NULL;
+static PyObject *make_call(PyPool *self, PyCall *c) {
+    return perform(self, c->operation, do_call, c) && report_messages(self)
+               ? PyLong_FromSize_t(c->troubled)
+               : NULL;
 }
 
 PyObject *py_step(PyObject *object, PyObject *mask) {
     PyPool *self = (PyPool *)object;
-    PyCall c = {.operation = STEP, .call = {.observations = self->buffers[OBSERVATIONS].buf}};
+    PyCall c = {.operation = STEP, .call = {.observations = self->observations}};
 
-    return make_call(self, &c, take_mask(self, mask, &c));
+    return take_mask(self, mask, &c) ? make_call(self, &c) : NULL;
 }
 
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
     PyCall c = {.operation = RESET};
 
-    return make_call(self, &c,
-                  require_arguments(nargs, 3) && take_start(self, args[0], args[1], &c) &&
-                      take_mask(self, args[2], &c));
+    return require_arguments(nargs, 3) && take_start(self, args[0], args[1], &c) &&
+                   take_mask(self, args[2], &c)
+               ? make_call(self, &c)
+               : NULL;
 }
 
 static void do_count_steps(PyPool *self, bool alone, void *context) {
@@ -99,7 +94,7 @@ static void do_ask(PyPool *self, bool alone, void *context) {
     Asking *a = context;
 
     (void)alone;
-    a->answer = pool_answer(&self->pool, matrix_of(&self->buffers[INPUTS]), a->request, &a->reader,
+    a->answer = pool_answer(&self->pool, self->inputs, a->request, &a->reader,
                             &a->writer);
 }
 
@@ -111,7 +106,6 @@ static PyObject *answer_of(const Asking *a) {
                           : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }
 
-/* Takes a request and its form. The memory of bytes is aligned. */
 PyObject *py_ask(PyObject *object, PyObject *args) {
     PyPool *self = (PyPool *)object;
     Asking a = {.answer = ANSWER_ERROR};
@@ -125,9 +119,8 @@ PyObject *py_ask(PyObject *object, PyObject *args) {
         PyErr_Format(PyExc_ValueError, "there is no request %d", request);
         return NULL;
     }
-    const char *bytes = PyBytes_AsString(form);
     a.request = (Request)request;
-    a.reader = (Reader){bytes, bytes + PyBytes_Size(form), NULL};
+    a.reader = reader_of(form);
     PyObject *result =
         perform(self, NO_OPERATION, do_ask, &a) && report_messages(self) ? answer_of(&a) : NULL;
     free(a.writer.bytes);

@@ -8,8 +8,8 @@
 typedef struct {
     PyObject *capsule; /* keeps what was prepared alive */
     Playing *playing; /* only the arrays of its results change */
-    Py_buffer actions;
     int64_t number; /* the action of the only environment, if it is an integer */
+    int operation; /* PLAY, BEFORE, AFTER or RESET */
     Turn turn;
     Call call;
     bool bad_action;
@@ -19,8 +19,6 @@ typedef struct {
 
 /* Lets a turn and its call refer to what was prepared. Returns false with an exception if nothing was. */
 static bool begin_turn(PyPool *self, PyTurn *t) {
-    const Py_buffer *inputs = &self->buffers[INPUTS];
-
     if (self->playing == NULL) {
         PyErr_SetString(PyExc_ValueError, "play was not prepared");
         return false;
@@ -28,41 +26,37 @@ static bool begin_turn(PyPool *self, PyTurn *t) {
     t->capsule = Py_NewRef(self->playing);
     t->playing = playing_of(t->capsule);
     const Play *play = &t->playing->form.play;
-    const Py_buffer *starts = &t->playing->buffers[STARTS];
     t->turn.play = play;
     t->call = (Call){
-        .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
-        .start = &((PyAccess *)t->playing->start)->access,
-        .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
+        .inputs = self->inputs,
+        .start = t->playing->start,
+        .start_values = t->playing->start_values,
         .mask = {(const char *)play->ended, 1},
         .turn = &t->turn,
     };
     return true;
 }
 
-static void end_turn(PyTurn *t) {
-    release_buffer(&t->actions);
-    Py_XDECREF(t->capsule);
-}
-
 /* Actions. Those of another type or shape come back as an exception; the caller then converts them. */
 
-static bool take_array(const Playing *playing, PyObject *actions, Py_buffer *b) {
-    const Py_buffer *kept = &playing->buffers[CURRENT];
+static bool take_array(PyArrayObject *actions, PyTurn *t) {
+    PyArrayObject *kept = t->playing->actions;
 
-    if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
+    if (!require_any_array(actions, "the actions")) {
         return false;
     }
-    const int first = playing->results.are_of_one && b->ndim == kept->ndim - 1;
-    return buffer_fits(b, IN_PLACE, "the actions", playing->action_item, kept->ndim - first,
-                       kept->shape + first);
+    const int dimensions = PyArray_NDIM(kept);
+    const int first = t->playing->results.are_of_one && PyArray_NDIM(actions) == dimensions - 1;
+    t->turn.actions = PyArray_BYTES(actions);
+    return require_array(actions, "the actions", PyArray_TYPE(kept), NPY_ARRAY_CARRAY_RO,
+                         dimensions - first, PyArray_DIMS(kept) + first);
 }
 
 static bool take_integer(PyObject *action, PyTurn *t) {
     PyObject *integer = PyBool_Check(action) ? NULL : PyNumber_Index(action);
 
     t->number = integer == NULL ? 0 : PyLong_AsLongLong(integer);
-    t->actions.buf = &t->number;
+    t->turn.actions = (const char *)&t->number;
     Py_XDECREF(integer);
     if (integer == NULL || PyErr_Occurred()) {
         PyErr_SetString(PyExc_TypeError, "the action is no integer of 64 bits");
@@ -74,12 +68,10 @@ static bool take_integer(PyObject *action, PyTurn *t) {
 /* Takes an array of actions, or the action of the only environment: an array, or an integer. */
 static bool take_actions(PyObject *actions, PyTurn *t) {
     const bool is_discrete = t->turn.play->actions.check == ACTIONS_IN_RANGE;
-    const bool good = is_discrete && t->playing->results.are_of_one && !PySequence_Check(actions)
-                          ? take_integer(actions, t)
-                          : take_array(t->playing, actions, &t->actions);
 
-    t->turn.actions = t->actions.buf;
-    return good;
+    return is_discrete && t->playing->results.are_of_one && !PySequence_Check(actions)
+               ? take_integer(actions, t)
+               : take_array((PyArrayObject *)actions, t);
 }
 
 static bool require_good_actions(bool are_bad) {
@@ -95,49 +87,39 @@ PyObject *py_check_actions(PyObject *object, PyObject *actions) {
     const bool good = begin_turn((PyPool *)object, &t) && take_actions(actions, &t) &&
                       require_good_actions(play_has_bad_action(&t.turn));
 
-    end_turn(&t);
+    Py_XDECREF(t.capsule);
     return good ? Py_NewRef(Py_None) : NULL;
 }
 
 /* Work inside of the pool */
 
-static void do_play(PyPool *self, bool alone, void *context) {
+static void do_turn(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
+    Pool *pool = &self->pool;
 
     t->call.alone = alone;
-    t->bad_action = play_has_bad_action(&t->turn);
-    if (!t->bad_action) {
-        t->troubled = pool_play(&self->pool, &t->call, &t->ends);
+    t->bad_action = t->turn.actions != NULL && play_has_bad_action(&t->turn);
+    if (t->bad_action) {
+        return;
     }
-}
-
-static void do_before(PyPool *self, bool alone, void *context) {
-    PyTurn *t = context;
-
-    t->call.alone = alone;
-    t->bad_action = play_has_bad_action(&t->turn);
-    if (!t->bad_action) {
-        pool_play_before(&self->pool, &t->call);
+    switch (t->operation) {
+    case BEFORE:
+        pool_play_before(pool, &t->call);
+        break;
+    case AFTER:
+        t->troubled = pool_play_after(pool, &t->call, &t->ends);
+        break;
+    case RESET:
+        t->troubled = pool_start(pool, &t->call, &t->ends);
+        break;
+    default:
+        t->troubled = pool_play(pool, &t->call, &t->ends);
     }
-}
-
-static void do_after(PyPool *self, bool alone, void *context) {
-    PyTurn *t = context;
-
-    t->call.alone = alone;
-    t->troubled = pool_play_after(&self->pool, &t->call, &t->ends);
-}
-
-static void do_start(PyPool *self, bool alone, void *context) {
-    PyTurn *t = context;
-
-    t->call.alone = alone;
-    t->troubled = pool_start(&self->pool, &t->call, &t->ends);
 }
 
 /* Returns false with an exception if the result cannot be used. */
-static bool play_turn(PyPool *self, int operation, Work *work, PyTurn *t) {
-    if (!perform(self, operation, work, t) || !require_good_actions(t->bad_action)) {
+static bool play_turn(PyPool *self, PyTurn *t) {
+    if (!perform(self, t->operation, do_turn, t) || !require_good_actions(t->bad_action)) {
         return false;
     }
     if (t->ends.outside) {
@@ -168,7 +150,7 @@ static void settle_starts(const ResultArrays *arrays, bool at_ends, PyTurn *t) {
     t->turn.drawn = (double *)(void *)memory_of(t, arrays, DRAWN_ARRAY);
     memcpy(mask, play->ended, play->count);
     if (at_ends) {
-        t->turn.last = arrays->last_memory;
+        t->turn.last = arrays->memory + results_place(&t->playing->results, LAST_ARRAYS);
         t->turn.started = (uint8_t *)mask;
     }
 }
@@ -181,11 +163,11 @@ static PyObject *result_of(const PyTurn *t, const ResultArrays *arrays) {
                            t->ends.ended > t->ends.started, any_started, at_ends);
 }
 
-static PyObject *step_with(PyPool *self, int operation, Work *work, bool at_ends, PyTurn *t) {
+static PyObject *step_with(PyPool *self, bool at_ends, PyTurn *t) {
     const Play *play = t->turn.play;
     Results *results = &t->playing->results;
     const bool starts =
-        operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
+        t->operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
     ResultArrays arrays;
     PyObject *result = NULL;
 
@@ -195,7 +177,7 @@ static PyObject *step_with(PyPool *self, int operation, Work *work, bool at_ends
         if (starts) {
             settle_starts(&arrays, at_ends, t);
         }
-        result = play_turn(self, operation, work, t) ? result_of(t, &arrays) : NULL;
+        result = play_turn(self, t) ? result_of(t, &arrays) : NULL;
     }
     results_release(results, &arrays);
     return result;
@@ -205,34 +187,33 @@ static PyObject *step_with(PyPool *self, int operation, Work *work, bool at_ends
 
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
-    PyTurn t = {.bad_action = false};
-    const bool good =
-        require_arguments(nargs, 2) && begin_turn(self, &t) && take_actions(args[0], &t);
-    PyObject *result =
-        good ? step_with(self, PLAY, do_play, args[1] == Py_True, &t) : NULL;
+    PyTurn t = {.operation = PLAY};
+    PyObject *result = require_arguments(nargs, 2) && begin_turn(self, &t) &&
+                               take_actions(args[0], &t)
+                           ? step_with(self, args[1] == Py_True, &t)
+                           : NULL;
 
-    end_turn(&t);
+    Py_XDECREF(t.capsule);
     return result;
 }
 
 /* What comes before the FMUs' part fills nothing that it returns. */
 PyObject *py_play_before(PyObject *object, PyObject *actions) {
     PyPool *self = (PyPool *)object;
-    PyTurn t = {.bad_action = false};
-    const bool done = begin_turn(self, &t) && take_actions(actions, &t) &&
-                      play_turn(self, BEFORE, do_before, &t);
+    PyTurn t = {.operation = BEFORE};
+    const bool done = begin_turn(self, &t) && take_actions(actions, &t) && play_turn(self, &t);
 
-    end_turn(&t);
+    Py_XDECREF(t.capsule);
     return done ? Py_NewRef(Py_None) : NULL;
 }
 
 PyObject *py_play_after(PyObject *object, PyObject *unused) {
     PyPool *self = (PyPool *)object;
-    PyTurn t = {.bad_action = false};
-    PyObject *result = begin_turn(self, &t) ? step_with(self, AFTER, do_after, false, &t) : NULL;
+    PyTurn t = {.operation = AFTER};
+    PyObject *result = begin_turn(self, &t) ? step_with(self, false, &t) : NULL;
 
     (void)unused;
-    end_turn(&t);
+    Py_XDECREF(t.capsule);
     return result;
 }
 
@@ -249,7 +230,7 @@ static PyObject *start_with(PyPool *self, PyObject *mask, PyTurn *t) {
             settle_results(&arrays, t);
             t->call.mask = (Mask){memory_of(t, &arrays, MASK_ARRAY), 1};
             t->turn.drawn = (double *)(void *)memory_of(t, &arrays, DRAWN_ARRAY);
-            result = play_turn(self, RESET, do_start, t)
+            result = play_turn(self, t)
                          ? results_of_reset(results, &arrays, t->troubled, t->ends.ended > 0)
                          : NULL;
         }
@@ -260,9 +241,9 @@ static PyObject *start_with(PyPool *self, PyObject *mask, PyTurn *t) {
 
 PyObject *py_start(PyObject *object, PyObject *mask) {
     PyPool *self = (PyPool *)object;
-    PyTurn t = {.bad_action = false};
+    PyTurn t = {.operation = RESET};
     PyObject *result = begin_turn(self, &t) ? start_with(self, mask, &t) : NULL;
 
-    end_turn(&t);
+    Py_XDECREF(t.capsule);
     return result;
 }

@@ -56,17 +56,65 @@ static void pool_dealloc(PyObject *object) {
     if (self->needs_closing) {
         close_at_the_end(self);
     }
-    for (int i = 0; i < BUFFERS; i++) {
-        release_buffer(&self->buffers[i]);
-    }
     opening_drop(&self->opening);
     Py_XDECREF(self->playing);
+    Py_XDECREF(self->arrays);
     Py_XDECREF(self->callback);
     release_memory(object);
     Py_DECREF(type);
 }
 
 /* Making */
+
+/* The arrays that a pool is made with. */
+typedef struct {
+    PyArrayObject *inputs, *outputs, *statuses, *observations, *health;
+} Arrays;
+
+static bool require_arrays(const Settings *s, const Arrays *a) {
+    const npy_intp n = (npy_intp)s->count;
+
+    return require_matrix(a->inputs, "inputs", NPY_DOUBLE, NPY_ARRAY_CARRAY,
+                          (npy_intp)s->inputs->count, n) &&
+           require_matrix(a->outputs, "outputs", NPY_DOUBLE, NPY_ARRAY_CARRAY,
+                          (npy_intp)s->outputs->count, n) &&
+           require_vector(a->statuses, "statuses", NPY_INT8, NPY_ARRAY_CARRAY, n) &&
+           require_matrix(a->observations, "observations", NPY_FLOAT, NPY_ARRAY_CARRAY, n,
+                          (npy_intp)s->num_observed) &&
+           require_matrix(a->health, "health", NPY_INT64, NPY_ARRAY_CARRAY, n, HEALTH_COUNTS);
+}
+
+static bool take_arrays(PyPool *self, PyObject *tuple) {
+    Settings *s = &self->opening.settings;
+    Arrays a;
+
+    if (!PyArg_ParseTuple(tuple, "OOOOO;arrays", &a.inputs, &a.outputs, &a.statuses,
+                          &a.observations, &a.health) ||
+        !require_arrays(s, &a)) {
+        return false;
+    }
+    self->arrays = Py_NewRef(tuple);
+    self->inputs = matrix_of(a.inputs);
+    self->observations = PyArray_DATA(a.observations);
+    s->output_values = PyArray_DATA(a.outputs);
+    s->status = PyArray_DATA(a.statuses);
+    s->health = PyArray_DATA(a.health);
+    return true;
+}
+
+static bool take_arguments(PyPool *self, PyObject *args) {
+    const char *form;
+    Py_ssize_t size;
+    PyObject *arrays, *callback;
+
+    if (!PyArg_ParseTuple(args, "y#O!O:Pool", &form, &size, &PyTuple_Type, &arrays, &callback) ||
+        !require_no_fault("a pool", opening_take(&self->opening, form, (size_t)size)) ||
+        !take_arrays(self, arrays)) {
+        return false;
+    }
+    self->callback = Py_NewRef(callback);
+    return true;
+}
 
 static bool open_pool(PyPool *self) {
     char error[8192];
@@ -91,7 +139,7 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     PyPool *self = (PyPool *)allocate(type, 0);
 
     (void)kwargs;
-    if (self != NULL && take_pool_arguments(self, args) && open_pool(self)) {
+    if (self != NULL && take_arguments(self, args) && open_pool(self)) {
         return (PyObject *)self;
     }
     Py_XDECREF((PyObject *)self);
@@ -102,8 +150,7 @@ static PyMethodDef methods[] = {
 #define FAST(name, function) {name, (PyCFunction)(void (*)(void))function, METH_FASTCALL, NULL}
     {"step", py_step, METH_O, NULL},
     FAST("reset", py_reset),
-    {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
-     NULL},
+    {"prepare_play", py_prepare_play, METH_VARARGS, NULL},
     FAST("play", py_play),
     {"check_actions", py_check_actions, METH_O, NULL},
     {"play_before", py_play_before, METH_O, NULL},

@@ -6,51 +6,37 @@
 
 /* Taking over */
 
-static bool take_makers(Results *r, PyObject *shapes) {
-    const Py_ssize_t count = PyTuple_Size(shapes), seen = count - OTHER_ARRAYS;
+bool results_take(Results *r, bool are_of_one, PyObject *patterns) {
+    const Py_ssize_t count = PyTuple_Size(patterns), seen = count - LAST_ARRAYS;
 
     if (seen < 0 || count > RESULT_ARRAYS) {
         PyErr_SetString(PyExc_ValueError, "results have too few or too many arrays");
         return false;
     }
+    r->are_of_one = are_of_one;
     r->number_of_seen = (size_t)seen;
-    for (Py_ssize_t i = 0; i < count; i++) {
-        PyObject *arguments = PyTuple_GetItem(shapes, i);
-        if (!maker_take(&r->makers[i], arguments) ||
-            (i < seen && !maker_take(&r->last[i], arguments))) {
+    for (Py_ssize_t i = 0; i < count + seen; i++) {
+        PyObject *pattern = PyTuple_GetItem(patterns, i % count);
+        if (!maker_take(&r->makers[i], (PyArrayObject *)pattern)) {
             return false;
         }
     }
     return true;
 }
 
-bool results_take(Results *r, PyObject *parts) {
-    int are_of_one;
-    PyObject *shapes;
-
-    if (!PyTuple_Check(parts)) {
-        PyErr_SetString(PyExc_TypeError, "expected a tuple of results");
-        return false;
-    }
-    if (!PyArg_ParseTuple(parts, "pO!;results", &are_of_one, &PyTuple_Type, &shapes)) {
-        return false;
-    }
-    r->are_of_one = are_of_one != 0;
-    return numpy_import() && take_makers(r, shapes);
-}
-
 void results_drop(Results *r) {
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
         maker_drop(&r->makers[i]);
-    }
-    for (size_t i = 0; i < MOST_SEEN; i++) {
-        maker_drop(&r->last[i]);
     }
 }
 
 /* Providing */
 
-static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) {
+static size_t end_of(const Results *r) {
+    return results_place(r, LAST_ARRAYS) + r->number_of_seen;
+}
+
+static bool provide(Results *r, size_t begin, size_t end, ResultArrays *a) {
     for (size_t i = begin; i < end; i++) {
         a->arrays[i] = maker_provide(&r->makers[i], &a->memory[i]);
         if (a->arrays[i] == NULL) {
@@ -60,47 +46,36 @@ static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) 
     return true;
 }
 
-/* Whatever fails, all arrays can be dropped. */
+/* Whatever fails, all arrays can be released. */
 static void clear(const Results *r, ResultArrays *a) {
-    memset(a->arrays, 0, results_place(r, OTHER_ARRAYS) * sizeof *a->arrays);
-    memset(a->last, 0, r->number_of_seen * sizeof *a->last);
+    memset(a->arrays, 0, end_of(r) * sizeof *a->arrays);
 }
 
 bool results_provide_step(Results *r, ResultArrays *a) {
     clear(r, a);
-    return provide_some(r, 0, results_place(r, STEP_ARRAYS), a);
+    return provide(r, 0, results_place(r, STEP_ARRAYS), a);
 }
 
-static bool provide_others(Results *r, ResultArrays *a) {
-    return provide_some(r, results_place(r, MASK_ARRAY), results_place(r, OTHER_ARRAYS), a);
-}
+bool results_provide_starts(Results *r, bool at_ends, ResultArrays *a) {
+    const size_t last = results_place(r, LAST_ARRAYS), end = at_ends ? end_of(r) : last;
 
-static bool provide_last(Results *r, ResultArrays *a) {
-    for (size_t i = 0; i < r->number_of_seen; i++) {
-        a->last[i] = maker_provide(&r->last[i], &a->last_memory[i]);
-        if (a->last[i] == NULL) {
-            return false;
-        }
-        maker_blank(&r->last[i], a->last_memory[i]);
+    if (!provide(r, results_place(r, MASK_ARRAY), end, a)) {
+        return false;
+    }
+    for (size_t i = last; i < end; i++) {
+        maker_blank(&r->makers[i], a->memory[i]);
     }
     return true;
 }
 
-bool results_provide_starts(Results *r, bool at_ends, ResultArrays *a) {
-    return (!at_ends || provide_last(r, a)) && provide_others(r, a);
-}
-
 bool results_provide_reset(Results *r, ResultArrays *a) {
     clear(r, a);
-    return provide_some(r, 0, r->number_of_seen, a) && provide_others(r, a);
+    return provide(r, 0, r->number_of_seen, a) && results_provide_starts(r, false, a);
 }
 
 void results_release(const Results *r, ResultArrays *a) {
-    for (size_t i = 0; i < results_place(r, OTHER_ARRAYS); i++) {
+    for (size_t i = 0; i < end_of(r); i++) {
         Py_XDECREF(a->arrays[i]);
-    }
-    for (size_t i = 0; i < r->number_of_seen; i++) {
-        Py_XDECREF(a->last[i]);
     }
 }
 
@@ -141,20 +116,17 @@ static PyObject *judged_of(const Results *r, const ResultArrays *a, size_t other
                                   : PyBool_FromLong(*memory);
 }
 
+/* Takes the references; Py_BuildValue takes twice as long. */
 static PyObject *tuple_of(PyObject *const *parts, Py_ssize_t count) {
     PyObject *tuple = PyTuple_New(count);
-    bool good = tuple != NULL;
 
     for (Py_ssize_t i = 0; i < count; i++) {
-        good = good && parts[i] != NULL;
-        if (tuple == NULL) {
-            Py_XDECREF(parts[i]);
-        } else {
+        if (tuple != NULL && parts[i] != NULL) {
             PyTuple_SetItem(tuple, i, parts[i]);
+        } else {
+            Py_XDECREF(parts[i]);
+            Py_CLEAR(tuple);
         }
-    }
-    if (!good) {
-        Py_CLEAR(tuple);
     }
     return tuple;
 }
@@ -163,7 +135,7 @@ static PyObject *starts_of(const Results *r, const ResultArrays *a, bool at_ends
     PyObject *const parts[] = {
         other_of(r, a, MASK_ARRAY),
         other_of(r, a, DRAWN_ARRAY),
-        at_ends ? seen_of(r, a->last) : Py_NewRef(Py_None),
+        at_ends ? seen_of(r, a->arrays + results_place(r, LAST_ARRAYS)) : Py_NewRef(Py_None),
     };
     return tuple_of(parts, sizeof parts / sizeof *parts);
 }
@@ -185,9 +157,8 @@ PyObject *results_of_step(const Results *r, const ResultArrays *a, size_t troubl
 PyObject *results_of_reset(const Results *r, const ResultArrays *a, size_t troubled,
                            bool any_ended) {
     PyObject *const parts[] = {
-        PyLong_FromSize_t(troubled),         PyBool_FromLong(any_ended),
-        seen_of(r, a->arrays),               other_of(r, a, MASK_ARRAY),
-        other_of(r, a, DRAWN_ARRAY),
+        PyLong_FromSize_t(troubled),  PyBool_FromLong(any_ended),   seen_of(r, a->arrays),
+        other_of(r, a, MASK_ARRAY), other_of(r, a, DRAWN_ARRAY),
     };
     return tuple_of(parts, sizeof parts / sizeof *parts);
 }

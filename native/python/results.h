@@ -4,33 +4,33 @@
 #define FMUGYM_RESULTS_H
 
 #include "pool/play.h"
-#include "python/reused_arrays.h"
+#include "python/arrays.h"
 
 /* After the arrays of observations and infos come those that only a step has (pool/play.h), then those
- * that only starts of episodes have. */
-enum { MASK_ARRAY = STEP_ARRAYS, DRAWN_ARRAY, OTHER_ARRAYS };
-enum { MOST_SEEN = MOST_ARRAYS - STEP_ARRAYS, RESULT_ARRAYS = MOST_SEEN + OTHER_ARRAYS };
+ * that only starts of episodes have, then those of the last observations and infos of episodes that end
+ * where others start. */
+enum { MASK_ARRAY = STEP_ARRAYS, DRAWN_ARRAY, LAST_ARRAYS };
+enum { MOST_SEEN = MOST_ARRAYS - STEP_ARRAYS, RESULT_ARRAYS = 2 * MOST_SEEN + LAST_ARRAYS };
 
 typedef struct {
     bool are_of_one; /* whether a number stands in the place of an array of one */
     size_t number_of_seen; /* arrays of observations and infos */
-    Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
+    Maker makers[RESULT_ARRAYS];
 } Results;
 
-/* The arrays of one step or reset, and their memory. If episodes start where others end, there are
- * more of observations and infos, for the last ones. */
+/* The arrays of one step or reset, and their memory. */
 typedef struct {
-    PyObject *arrays[RESULT_ARRAYS], *last[MOST_SEEN];
-    char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
+    PyObject *arrays[RESULT_ARRAYS];
+    char *memory[RESULT_ARRAYS];
 } ResultArrays;
 
-/* Takes a tuple: whether results are those of a single environment; and the shape and type of each array:
- * those of observations and infos, then rewards, terminated, truncated, mask and drawn values. Returns
- * false with an exception if it does not fit. The results must be dropped in any case. */
-bool results_take(Results *results, PyObject *parts);
+/* Takes a tuple of patterns of each array: those of observations and infos, then rewards, terminated,
+ * truncated, mask and drawn values. Returns false with an exception if it does not fit. The results must
+ * be dropped in any case. */
+bool results_take(Results *results, bool are_of_one, PyObject *patterns);
 void results_drop(Results *results);
 
-/* The place of one of the other arrays. */
+/* The place of an array after those of observations and infos. */
 static inline size_t results_place(const Results *results, size_t other) {
     return results->number_of_seen + other;
 }

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import pytest
 
 from fmugym import ConfigError
-from fmugym.environment.value_mappings import EpisodeVariables, LateDict, NamedValues
+from fmugym.environment.value_mappings import UNFILLED, EpisodeVariables, LateDict, NamedValues
 
 
 class TestNamedValues:
@@ -171,7 +171,7 @@ class TestLateDict:
             self.calls += 1
             return {"a": 1 + offset, "b": 2}
 
-        return LateDict(fill, 0)
+        return LateDict({UNFILLED: (fill, 0)})
 
     def test_every_method_of_dict_is_tried(self):
         others = {

@@ -72,21 +72,17 @@ class TestArrays:
 
     def test_health_that_is_not_aligned(self):
         counts = misaligned(no_counts(1).shape, np.int64)
-        with pytest.raises(ValueError, match="health must begin at a multiple of 8 bytes"):
+        with pytest.raises(ValueError, match="health must be C-contiguous, aligned"):
             counting_in(counts)
 
-    def test_an_item_size_that_its_format_does_not_have_everywhere(self):
-        """A long has 4 bytes on Windows, and in the standard sizes of struct."""
-        testbuffer = pytest.importorskip(
-            "_testbuffer", reason="this Python was built without its test modules"
-        )
-        names = no_counts(1).size
-        flags = testbuffer.ND_WRITABLE
-        counts = testbuffer.ndarray([0] * names, shape=[1, names], format="=l", flags=flags)
-        with pytest.raises(
-            TypeError, match="health must be an array of int64, not of type '=l' with 4 bytes"
-        ):
-            counting_in(counts)
+    @pytest.mark.parametrize("dtype", ["i4", "u8", ">i8"])
+    def test_another_type(self, dtype):
+        with pytest.raises(TypeError, match="health must be an array of int64, not of "):
+            counting_in(no_counts(1).astype(dtype))
+
+    def test_a_list(self):
+        with pytest.raises(TypeError, match="health must be an array of numpy"):
+            counting_in(no_counts(1).tolist())
 
     def test_actions_that_are_not_aligned(self, make_envs):
         with_these, with_others = (make_envs(in_way("arrays", CartPoleEnv), 6) for _ in range(2))
@@ -372,7 +368,7 @@ class TestPrograms:
     def test_rows_beyond_the_start_values(self, cart_poles, row):
         """They say where in memory draws are written."""
         prepare(cart_poles, program(FAILED), rows=(0, -1))
-        with pytest.raises(ValueError, match="a draw is for no start value"):
+        with pytest.raises(ValueError, match="one is for no start value"):
             prepare(cart_poles, program(FAILED), rows=(row,))
 
     def test_what_does_not_hold_draws(self, cart_poles):

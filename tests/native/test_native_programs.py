@@ -99,7 +99,7 @@ def test_neighbouring_rows_become_neighbouring_elements(n):
 def test_neighbours_that_do_not_exist(line):
     rows = np.zeros(3), np.zeros(3), np.zeros(3, np.float32)
     elements = np.zeros((3, 5), np.float32).T
-    with pytest.raises(ValueError, match="a program is not sound"):
+    with pytest.raises(ValueError, match="the form of a program is damaged"):
         evaluate((line,), (*rows, *(elements[i] for i in (0, 1, 3))))
 
 
@@ -152,7 +152,7 @@ def test_interpolation_is_that_of_numpy(xs, ys):
     "line", [("load_row", 0, 0), ("load_row", 0, 1, 60000), ("add d", 0, 0, 1, 1)], ids=str
 )
 def test_constants_stay_and_every_operand_exists(line):
-    with pytest.raises(ValueError, match="a program is not sound"):
+    with pytest.raises(ValueError, match="the form of a program is damaged"):
         evaluate((line,), (np.zeros(3),), kept=(1.0,))
 
 

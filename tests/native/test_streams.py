@@ -274,6 +274,13 @@ def test_a_refused_step_draws_nothing(make_envs):
     np.testing.assert_array_equal(envs.step(zeros)[0], twins.step(zeros)[0])
 
 
+def drawn_once(form, standard_normal=0):
+    """Draw an episode from a stream."""
+    from fmugym import _native
+
+    _native.draw((form, standard_normal, 0), np.ones((1, 6), np.uint64), np.empty((1, 1)))
+
+
 class TestGuards:
     @pytest.mark.parametrize(
         ("row", "numbers"),
@@ -300,29 +307,31 @@ class TestGuards:
         kind = row[0] if isinstance(row[0], int) else _native.DISTRIBUTIONS.index(row[0])
         table = np.array([kind, *row[1:]], np.int64)
         with pytest.raises(ValueError, match="numbers do not fit"):
-            _native.Draws(form_of_draws(table, numbers), module._standard_normal())
+            drawn_once(form_of_draws(table, numbers), module._standard_normal())
 
     def test_a_table_of_odd_length(self):
-        from fmugym import _native
-
         with pytest.raises(ValueError, match="ends too early"):
-            _native.Draws(bytes(33), 0)
+            drawn_once(bytes(33))
 
     def test_what_is_no_bit_generator(self):
+        from fmugym import _native
+
         draws = draws_of(Uniform(0, 1)).native
         with pytest.raises(ValueError, match="PyCapsule"):
-            draws.take_from(None, np.empty(1))
+            _native.draw_from(draws, None, np.empty(1), np.empty(1))
 
     def test_too_few_start_values(self):
         from fmugym import _native
 
         kind = _native.DISTRIBUTIONS.index("uniform")
         table = np.array([[kind, 1, 0, 2]], np.int64)
-        draws = _native.Draws(form_of_draws(table, np.array([0.0, 1.0])), 0)
-        with pytest.raises(ValueError, match="too few rows"):
-            draws.take_from(np.random.PCG64().capsule, np.empty(1))
+        draws = form_of_draws(table, np.array([0.0, 1.0])), 0, 0
+        with pytest.raises(ValueError, match="one is for no start value"):
+            _native.draw_from(draws, np.random.PCG64().capsule, np.empty(1), np.empty(1))
 
     def test_values_for_other_streams(self):
+        from fmugym import _native
+
         draws = draws_of(Uniform(0, 1)).native
-        with pytest.raises(ValueError, match="values must have the shape"):
-            draws.take(np.zeros((3, 6), np.uint64), np.empty((1, 2)))
+        with pytest.raises(ValueError, match=r"values must have the shape \(1, 3\), not \(1, 2\)"):
+            _native.draw(draws, np.zeros((3, 6), np.uint64), np.empty((1, 2)))

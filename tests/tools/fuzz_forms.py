@@ -110,7 +110,7 @@ def refusals():
     """A refusal of the extension counts as one of the package."""
     try:
         yield
-    except (ValueError, TypeError, OSError, IndexError, MemoryError) as error:
+    except (ValueError, OSError, IndexError, MemoryError) as error:
         raise SimulationError(type(error).__name__) from None
 
 
@@ -171,7 +171,7 @@ def listing_form(rng):
 
     def play():
         with refusals():
-            _native.Access(form)
+            _native.access(form)
 
     return Case(play, "listing")
 
@@ -183,9 +183,7 @@ def draws_form(rng):
 
     def play():
         with refusals():
-            draws = _native.Draws(form, 0)
-            streams = np.ones((2, 6), np.uint64)
-            draws.take(streams, np.array([0, 1]), np.zeros((2, 2)))
+            _native.draw((form, 0, 0), np.ones((2, 6), np.uint64), np.zeros((2, 2)))
 
     return Case(play, "draws")
 
@@ -263,7 +261,7 @@ def play_form(rng):
         pool = _native.Pool(form_of_programs(spec, N, 1), (*own, no_counts(N)), print)
         parts, form = play_of(*own[:2]), lambda *a: damaged(rng, form_of_play(*a))
         with mock.patch.object(native_pool, "form_of_play", form), refusals():
-            prepare(pool, _native.Access(form_of_listing(())), *parts)
+            prepare(pool, _native.access(form_of_listing(())), *parts)
             for _ in range(3):
                 pool.play_before(np.zeros(N))
                 pool.play_after()

@@ -152,8 +152,7 @@ class Subject:
         self.pool.step_own()
 
     def step(self):
-        inputs = np.zeros((len(self.pool.inputs), self.n))
-        self.pool._pool.step(inputs, self.mask(), None)  # as numpy would race with other calls
+        self.pool._pool.step(self.mask())  # as numpy would race with other calls
 
     def reset(self):
         values = self.values.copy()
@@ -186,11 +185,9 @@ class Subject:
         )
 
     def draw(self):
-        """Seed streams and draw from them while other threads play."""
-        states = self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)
-        indices = np.arange(self.n)
-        _native.seed(states, indices, self.rng.bytes(4 * self.n))
-        DRAWS.take(states, indices, np.empty((1, self.n)))
+        """Draw from streams while other threads play."""
+        streams = self.rng.integers(2**64, size=(self.n, 6), dtype=np.uint64)
+        _native.draw(DRAWS, streams, np.empty((1, self.n)))
 
     def play(self):
         actions = self.rng.integers(0, 2, self.n)

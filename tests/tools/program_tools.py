@@ -38,13 +38,13 @@ def uniform_draws(*rows):
     """Uniform numbers from [0, 1), one for each row of the start values."""
     kind = _native.DISTRIBUTIONS.index("uniform")
     table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
-    return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
+    return form_of_draws(table, [0.0, 1.0]), 0, 0
 
 
 def results_of(count, observed, draws):
     """What a step returns: a tuple, with so many outputs that the pool observes, and draws."""
-    flags, seen = ((count,), bool), ((count, observed), np.float32)
-    arrays = seen, ((count,), float), flags, flags, flags, ((draws, count), float)
+    flags, seen = np.empty(count, bool), np.empty((count, observed), np.float32)
+    arrays = seen, np.empty(count), flags, flags, flags, np.empty((draws, count))
     zero = np.float64(0.0).tobytes()
     unstepped = tuple((row, zero) for row in RESULT_ROWS)
     return {"seen": 1, "results": (False, arrays), "unstepped": unstepped}

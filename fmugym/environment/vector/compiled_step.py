@@ -209,7 +209,7 @@ def prepare_step(
         | {
             "unstepped": tuple((find((kind, 0)), b"\0") for kind in (*_RESULTS, "done", "ended")),
             "seen": len(seen),
-            "results": (are_of_one, (*seen, *others)),
+            "results": (are_of_one, tuple(np.empty(*one) for one in (*seen, *others))),
         },
     )
 

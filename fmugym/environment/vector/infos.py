@@ -22,7 +22,7 @@ from gymnasium import spaces
 
 from fmugym.environment.episode import environments_first
 from fmugym.environment.episode_start import EpisodeStart
-from fmugym.environment.value_mappings import LateDict
+from fmugym.environment.value_mappings import UNFILLED, LateDict
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.pool import FloatArray, MaskArray
 
@@ -172,7 +172,7 @@ def add_starts(
         drawn: What they have drawn, shape (draws, N), which is rarely read.
         mask: The environments. No caller changes it.
     """
-    infos["drawn"] = LateDict(_told, draws, drawn, mask)
+    infos["drawn"] = LateDict({UNFILLED: (_told, draws, drawn, mask)})
     infos["_drawn"] = mask
 
 

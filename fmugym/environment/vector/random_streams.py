@@ -105,8 +105,10 @@ class EpisodeStreams:
         self.require_seeds()
         values = np.empty((len(draws.drawn), len(indices)))
         if draws.native is not None:
+            from fmugym._native import draw
+
             rows = self.states[indices]
-            draws.native.take(rows, values)
+            draw(draws.native, rows, values)
             self.states[indices] = rows
             return values
         for place, index in enumerate(indices.tolist()):

@@ -186,7 +186,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
             getattr(around, name)(*given)
     before = envs.pool.outputs.copy()
     assert around.step(None) == 3
-    nothing = _native.Access(form_of_listing(()))
+    nothing = _native.access(form_of_listing(()))
     assert around.reset(nothing, np.zeros((0, 3)), None) == 3
     code, answer = around.ask(Request.READ, request_listing((), 2))
     assert code == Answer.TROUBLE

@@ -159,7 +159,8 @@ def test_arrays_may_have_many_dimensions():
         np.testing.assert_array_equal(deep[0].reshape(NUM_ENVS, 2), flat[0])
 
 
-SEEN, REAL, FLAGS, DRAWN = ((3, 4), np.float32), ((3,), float), ((3,), bool), ((4, 3), float)
+SEEN, REAL, FLAGS = np.empty((3, 4), np.float32), np.empty(3), np.empty(3, bool)
+DRAWN = np.empty((4, 3))
 ARRAYS = SEEN, REAL, FLAGS, FLAGS, FLAGS, DRAWN
 
 
@@ -176,10 +177,10 @@ def test_results_that_fit_are_taken(monkeypatch):
         {"arrays": ()},
         {"arrays": ARRAYS[:-1]},
         {"arrays": ARRAYS[:3]},
-        {"arrays": (((3, 5), np.float32), *ARRAYS[1:])},
-        {"arrays": (SEEN, ((3,), np.float32), *ARRAYS[2:])},
-        {"arrays": (*ARRAYS[:-2], ((4,), bool), DRAWN)},
-        {"arrays": (*ARRAYS[:-1], ((5, 3), float))},
+        {"arrays": (np.empty((3, 5), np.float32), *ARRAYS[1:])},
+        {"arrays": (SEEN, np.empty(3, np.float32), *ARRAYS[2:])},
+        {"arrays": (*ARRAYS[:-2], np.empty(4, bool), DRAWN)},
+        {"arrays": (*ARRAYS[:-1], np.empty((5, 3)))},
         {"arrays": 7},
         {"are_of_one": True},
     ],
