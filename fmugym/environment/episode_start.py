@@ -341,7 +341,7 @@ class EpisodeStart:
         bits = rng.bit_generator
         with bits.lock:
             self._draw_natively(bits.capsule, self._row, self._drawn)
-        values: list[float] = self._drawn.tolist()
+        values = self._drawn.tolist()
         return values
 
     def _drawn_by(self, rng: np.random.Generator) -> list[float]:
