@@ -105,7 +105,7 @@ def usual(name):
     if letter in "df":
         columns = np.random.default_rng(0).uniform(-3.0, 3.0, (ufunc.nin, 300)).astype(letter)
         columns[:, :100] = np.round(columns[:, :100]) + 0
-    if name == "floor_divide d":  # exports make no infinities of zeros
+    if name == "floor_divide d":  # ONNX makes no infinities of zeros
         columns[1][columns[1] == 0] = 1.0
     if letter == "q":  # no overflow, which C leaves open
         columns = [one % 41 - 20 for one in columns]
