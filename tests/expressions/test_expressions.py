@@ -80,7 +80,7 @@ def require_near(found, wanted):
 
 
 def require_programs(value, columns, wanted):
-    """At any number of environments, at columns with a stride, and where all are the same."""
+    """At any number of environments, at columns with a stride, and where some are the same."""
     count, run = len(wanted), program_of(value)
     for length in (*LENGTHS, count):
         (found,) = run({name: one[:length] for name, one in columns.items()})
@@ -92,6 +92,11 @@ def require_programs(value, columns, wanted):
     same = [{name: np.repeat(one, 130) for name, one in column.items()} for column in ones[::3]]
     found = np.concatenate([run(one)[0] for one in same])
     require_bits(found, np.repeat(wanted[::15], 130), "130 times the same")
+    for column in columns.values() if len(columns) > 1 else ():
+        values, counts = np.unique(column, return_counts=True)
+        for one in values[counts > 9]:
+            rows = {name: other[column == one] for name, other in columns.items()}
+            require_bits(run(rows)[0], wanted[column == one], f"{one} beside others")
 
 
 def require_hooks(value, columns, wanted):
