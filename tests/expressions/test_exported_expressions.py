@@ -98,22 +98,34 @@ REFUSED_IN_ONNX = {"cbrt d", "trunc d", "copysign d"}
 REFUSED_IN_ONNX |= {"bitwise_and q", "bitwise_xor q", "right_shift q"}
 
 
-def usual(name):
-    """Usual operands of an operation, with equal ones and zeros, and what programs make of them."""
+def all_kinds(name):
+    """Operands of an operation: zeros, infinities and no numbers among them."""
     ufunc, letter = OPERATIONS[name]
-    columns = [one.copy() for one in operands(2 * letter)][: ufunc.nin]
-    if letter in "df":
-        columns = np.random.default_rng(0).uniform(-3.0, 3.0, (ufunc.nin, 300)).astype(letter)
-        columns[:, :100] = np.round(columns[:, :100]) + 0
-    if name == "floor_divide d":  # ONNX makes no infinities of zeros
-        columns[1][columns[1] == 0] = 1.0
+    columns = operands(2 * letter)[: ufunc.nin]
     if letter == "q":  # no overflow, which C leaves open
         columns = [one % 41 - 20 for one in columns]
         columns[-1] = np.abs(columns[-1]) + 1
-    names = dict(zip("xy", columns, strict=False))
-    graph = Graph()
+    return columns
+
+
+def usual(name):
+    """Usual operands of an operation, with equal ones and zeros."""
+    ufunc, letter = OPERATIONS[name]
+    if letter not in "df":
+        return all_kinds(name)
+    columns = np.random.default_rng(0).uniform(-3.0, 3.0, (ufunc.nin, 300)).astype(letter)
+    columns[:, :100] = np.round(columns[:, :100]) + 0
+    if name == "floor_divide d":  # ONNX makes no infinities of zeros
+        columns[1][columns[1] == 0] = 1.0
+    return list(columns)
+
+
+def of_program(name, columns):
+    """What a program makes of the operands of an operation."""
+    ufunc, letter = OPERATIONS[name]
+    graph, names = Graph(), dict(zip("xy", columns, strict=False))
     value = ufunc(*(Value.read(graph, one, dtype=letter) for one in names))
-    return list(columns), program_of(value)(names)[0]
+    return program_of(value)(names)[0]
 
 
 def test_c_has_each_operation(tmp_path):
@@ -125,16 +137,18 @@ def test_c_has_each_operation(tmp_path):
         return helpers.setdefault((helper, letter), f"own_{helper}_{letter}")
 
     for name in known:
-        (ufunc, letter), (_, wanted) = OPERATIONS[name], usual(name)
+        ufunc, letter = OPERATIONS[name]
+        result = C_TYPES[of_program(name, all_kinds(name)).dtype.char.replace("l", "q")]
         text = expression(ufunc, ["x", "y"][: ufunc.nin], np.dtype(letter), use)
         parameters = ", ".join(f"{C_TYPES[letter]} {one}" for one in "xy"[: ufunc.nin])
         function = in_library(name)
-        lines.append(f"{C_TYPES[wanted.dtype.char.replace('l', 'q')]} {function}({parameters})")
+        lines.append(f"{result} {function}({parameters})")
         lines.append(f"{{\n    return {text};\n}}")
     own = [HELPERS[one].format(T=C_TYPES[kind], name=n) for (one, kind), n in helpers.items()]
     library = built("\n".join([INCLUDES, *own, *lines]), tmp_path)
     for name in known:
-        letter, (columns, wanted) = OPERATIONS[name][1], usual(name)
+        letter, columns = OPERATIONS[name][1], all_kinds(name)
+        wanted = of_program(name, columns)
         function = library[in_library(name)]
         function.argtypes = [KINDS[letter]] * len(columns)
         function.restype = KINDS[wanted.dtype.char.replace("l", "q")]
@@ -200,7 +214,8 @@ def test_constants_in_c_keep_all_bits(value, letter, tmp_path):
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_onnx_has_each_operation(name):
     """Or refuses it."""
-    (ufunc, letter), (columns, wanted) = OPERATIONS[name], usual(name)
+    (ufunc, letter), columns = OPERATIONS[name], usual(name)
+    wanted = of_program(name, columns)
 
     def apply(graph, nodes):
         return ufunc(*(Value(graph, node) for node in nodes)).node

@@ -32,7 +32,7 @@ from fmugym.expressions import functions, program
 from fmugym.expressions.compiler import Store, compile_graph
 from fmugym.expressions.functions import chance, noise
 from fmugym.expressions.graph import Graph, Value
-from fmugym.expressions.language import Expression, Names
+from fmugym.expressions.language import CONSTANTS, Expression, Names
 from fmugym.expressions.numpy_evaluation import function_of
 
 LENGTHS = (1, 2, 15, 16, 17, 127, 128, 129, 260)
@@ -44,6 +44,11 @@ def value_of(text, types=NAMES):
     graph = Graph()
     found = {name: Value.read(graph, name, dtype=letter) for name, letter in types.items()}
     return Expression.parse(text).value(Names(graph, found.get, known=lambda: list(found)))
+
+
+def names_in(text):
+    """The names of the table that a text reads."""
+    return sorted(Expression.parse(text).names & NAMES.keys())
 
 
 def program_of(*values):
@@ -115,6 +120,10 @@ def test_each_function_of_the_language_has_a_row():
     assert {text.partition("(")[0] for text in FUNCTIONS} == set(functions.FUNCTIONS)
 
 
+def test_each_constant_of_the_language_has_a_row():
+    assert set(CONSTANTS) <= {name for text in TEXTS for name in Expression.parse(text).names}
+
+
 def test_each_operator_of_python_has_a_row_or_is_refused():
     kinds = ast.operator, ast.unaryop, ast.cmpop, ast.boolop
     known = {one for kind in kinds for one in kind.__subclasses__()}
@@ -151,7 +160,7 @@ def test_a_hook_in_python_has_the_value_of_numpy(text):
 
 def given_row(text):
     """The row of a text, its value, numbers for its names, and what numpy makes of them."""
-    names = sorted(Expression.parse(text).names)
+    names = names_in(text)
     columns = dict(zip(names, operands("".join(NAMES[name] for name in names)), strict=True))
     with np.errstate(all="ignore"):
         wanted = np.asarray(TEXTS[text].wanted(*columns.values()))
@@ -271,7 +280,7 @@ def filled(text, texts):
 
 def part_of(text, inner):
     """A row of the table with other parts in the places of its names."""
-    row, names = TEXTS[text], sorted(Expression.parse(text).names)
+    row, names = TEXTS[text], names_in(text)
     whole = filled(text, {name: inner[name].text for name in names})
     return Part(whole, lambda columns: row.wanted(*(inner[one].wanted(columns) for one in names)))
 
