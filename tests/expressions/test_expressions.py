@@ -337,7 +337,7 @@ def test_an_expression_of_expressions_has_the_value_of_numpy(engine, part):
 
 def chains_of(parts, signs):
     """One part or more with operators between them."""
-    others = st.lists(st.tuples(st.sampled_from(signs), parts).map(" ".join), max_size=3)
+    others = st.lists(st.tuples(st.sampled_from(signs), parts).map(" ".join), max_size=2)
     return st.builds(lambda first, others: " ".join([first, *others]), parts, others)
 
 
