@@ -104,10 +104,11 @@ SLOW_MODULES = {
 
 WITHOUT_EXTENSION = {
     "test_clock_shift",
-    "test_declared_expressions",
+    "test_conversions",
     "test_declared_tables",
     "test_distributions",
     "test_executable",
+    "test_expressions",
     "test_files",
     "test_fmu_log",
     "test_hostile_archive",
@@ -124,6 +125,7 @@ WITHOUT_EXTENSION = {
 """Modules that run where the C extension was not built, but for tests with ``engine``."""
 
 EVERY = {
+    "test_expressions": 5,
     "test_golden_tasks": 8,
     "test_hostile_archive": 19,
     "test_pool": 7,
@@ -137,6 +139,8 @@ EVERY_OF_OTHERS = 61
 
 EVERY_IN_CI = {
     "test_golden_tasks": 1,
+    "test_expressions": 1,
+    "test_exported_expressions": 1,
     "test_export_search": 3,
     "test_declared_physical": 3,
     "test_declared_weather": 3,
@@ -176,6 +180,9 @@ EVERY_OF_OTHERS_IN_CI = 7
 
 SLOW_TESTS = (
     "test_env.py::test_time_is_exact",
+    "test_exported_expressions.py::test_an_agent_in_onnx",
+    "test_exported_expressions.py::test_curves_in_onnx",
+    "test_exported_expressions.py::test_onnx_has",
     "test_identification.py::TestMeasured",
     "test_process_files.py::test_names_of_instances",
     "test_golden_tasks.py::test_an_onnx",

@@ -272,50 +272,6 @@ class TestOverridden:
         assert is_same(one, played(make_envs(functools.partial(Same, **keys), 3)))
 
 
-@pytest.mark.parametrize(
-    ("keys", "text"),
-    [
-        (
-            {"terminated": "phy > 1"},
-            "config key 'terminated': unknown name 'phy'; did you mean 'phi'",
-        ),
-        ({"terminated": "x"}, "config key 'terminated': expected a condition .*, got 'x'"),
-        ({"terminated": "done"}, "'done' is known in 'reward'"),
-        ({"terminated": "x >"}, "'terminated': 'x >' is no expression"),
-        ({"reward": "action[0]"}, "unknown name 'action\\[0\\]'; did you mean 'action'"),
-        ({"reward": "1", "positive_reward": 2.0}, "'reward' and 'positive_reward' contradict"),
-        ({"reward": {"near": {"expr": "x", "wight": 2}}}, "did you mean 'weight'"),
-        ({"inputs": {"g": "1"}}, "unknown input in 'inputs' 'g'; .* 'f'"),
-        ({"inputs": {"f": "previous(x)"}}, "no value before the step"),
-        (
-            {"memory": {"n": {"start": 0, "update": "n + m"}}},
-            "config key 'memory': unknown name 'm'",
-        ),
-        ({"memory": {"n": {"start": 0}}}, "'update' is missing"),
-        (
-            {"memory": {"n": {"start": 0, "update": "1"}}, "episode_variables": {"n": 1}},
-            "'n' is in",
-        ),
-        ({"memory": {"x_0": {"start": 0, "update": "1"}}}, "'x_0' is both"),
-        ({"memory": {"pi": {"start": 0, "update": "1"}}}, "'pi' has a name with a meaning"),
-        ({"episode_variables": {"time": 0}}, "'time' has a name with a meaning"),
-        ({"costs": {"much": "sqr(x)"}}, "unknown function 'sqr'; did you mean 'sqrt'"),
-        ({"observations": ["x", "y"]}, "config key 'observations': unknown name 'y'"),
-        ({"info": {"cost": "1"}}, "'cost' has a meaning of its own"),
-    ],
-)
-def test_mistakes_are_told_with_their_key(keys, text):
-    with pytest.raises(ConfigError, match=text):
-        Expressed(**keys)
-
-
-def test_all_mistakes_are_told_at_once():
-    with pytest.raises(ConfigError, match="'y'") as caught:
-        Expressed(reward="y", truncated="z > 1", costs={"more": "a", "less": "b"})
-    for name in ("'z'", "'a'", "'b'"):
-        assert name in str(caught.value)
-
-
 def test_a_class_must_say_when_it_ends():
     with pytest.raises(ConfigError, match=r"'terminated', such as .* or override _is_done"):
         FMI2CSEnv(bundled_fmu("Pendulum"), PENDULUM)

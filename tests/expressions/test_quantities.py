@@ -78,6 +78,19 @@ def test_of_many_environments(make_envs):
             assert infos["reward_terms"][name].tolist() == expected, name
 
 
+@pytest.mark.parametrize("hooks", ["expressions", "Python"])
+def test_outputs_are_observed_in_any_order_and_twice(load, hooks):
+    names = ["theta_dot", "theta", "theta_dot", "theta", "theta"]
+    variables = TASK["variables"] | {f"own_{n}": {"name": name} for n, name in enumerate(names)}
+    observed = {"actions": "tau", "observations": [f"own_{n}" for n in range(5)]}
+    env = load(TASK | {"variables": variables, "agent": observed}, way=hooks)
+    env.reset(seed=1)
+    env.action_space.seed(1)
+    for _ in range(10):
+        observation, *_ = env.step(env.action_space.sample())
+        assert observation.tolist() == np.float32([env.out[name] for name in names]).tolist()
+
+
 class Pushed(fmugym.FMI2CSEnv):
     """The pendulum, driven by twice the action."""
 

@@ -271,32 +271,6 @@ def plant_of(env, tmp_path):
     slave.freeInstance()
 
 
-FUNCTIONS = [
-    *(np.add, np.subtract, np.multiply, np.divide, np.minimum, np.maximum, np.remainder),
-    *(np.floor_divide, np.fmod, np.hypot, np.arctan2, np.power, np.float_power),
-    *(np.sin, np.cos, np.tan, np.arcsin, np.arccos, np.arctan, np.sinh, np.cosh, np.tanh),
-    *(np.arcsinh, np.arccosh, np.arctanh, np.exp, np.exp2, np.expm1, np.log, np.log2, np.log10),
-    *(np.log1p, np.sqrt, np.absolute, np.negative, np.floor, np.ceil, np.rint),
-    *(np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal),
-]
-"""Functions that agents may use in C and ONNX."""
-
-
-def arguments_of(ufunc, dtype):
-    """Arguments that a function is defined for, with signs, zeros and equal numbers among them."""
-    rng = np.random.default_rng(0)
-    first, second = rng.uniform(-3, 3, (2, 200))
-    first[:4], second[:4] = [0.0, 1.5, -1.5, 1.0], [2.0, 1.5, 0.5, -1.0]
-    name = ufunc.__name__
-    if name in {"arcsin", "arccos", "arctanh"}:
-        first = first / 3.1
-    if name in {"log", "log2", "log10", "log1p", "sqrt", "power", "float_power"}:
-        first = abs(first) + 0.1
-    if name == "arccosh":
-        first = abs(first) + 1.1
-    return [part.astype(dtype) for part in (first, second)[: ufunc.nin]]
-
-
 ACTIVATIONS = [
     *map(Activation, ["tanh", "relu", "sigmoid", "silu"]),
     Activation("leaky_relu", (0.02,)),

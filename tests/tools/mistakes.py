@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import tomlkit
+from gymnasium import spaces
 
 import fmugym
 from fmugym.cli.command_line import _parser, run_command_line
@@ -365,16 +366,6 @@ FILES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
     ),
     ({"parameters": {"m": {"low": 0, "high": 1}}}, ("'distribution'", "0.0")),
     ({"parameters": {"m": {"distribution": "choice", "values": []}}}, ("[]", "at least one")),
-    ({"reward": ""}, ("''", "empty")),
-    ({"reward": "(q - 1"}, ("'(q - 1'", "never closed", "column 1")),
-    ({"reward": "q - 1)"}, ("'q - 1)'", "unmatched", "column 6")),
-    ({"reward": "q == 1 ? 2"}, ("'q == 1 ? 2'", "column 8")),
-    ({"reward": "q ^ 2"}, ("'q ^ 2'", "**", "power")),
-    ({"reward": "Q"}, ("'Q'", "'q'")),
-    ({"reward": "abs(q, 1)"}, ("abs", "1", "2")),
-    ({"reward": "q.x"}, ("unknown name 'q.x'", "'q'")),
-    ({"reward": "'a'"}, ("'a'", "number")),
-    ({"reward": "lambda: 1"}, ("lambda",)),
     ({"reward": {"a": {"weight": 1}}}, ("reward.a", "'expr'")),
     ({"terminated": "q"}, ("'q'", "condition", "x > 1")),
     ({"terminated": "q = 1"}, ("'q = 1'", "==")),
@@ -400,6 +391,105 @@ FILES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
     ({"inputs": {"tau": "q"}}, ("'tau'", "action")),
     ({"arguments": {"a": 1}}, ("'arguments'", "'class'")),
 )
+
+
+# Expressions
+
+
+EXPRESSIONS: dict[str, tuple[str, ...]] = {
+    "": ("''", "empty"),
+    "(q - 1": ("'(q - 1'", "never closed", "column 1"),
+    "q - 1)": ("'q - 1)'", "unmatched", "column 6"),
+    "q == 1 ? 2": ("'q == 1 ? 2'", "column 8"),
+    "q tau": ("'q tau'", "column"),
+    "q ^ 2": ("'q ^ 2'", "**", "power"),
+    "q // tau": ("operator in 'q // tau'",),
+    "q & tau": ("operator in 'q & tau'", "and"),
+    "~q": ("~", "write 'not'"),
+    "q is tau": ("Is is not allowed",),
+    "Q": ("'Q'", "'q'"),
+    "q.x": ("unknown name 'q.x'", "'q'"),
+    "q[0]": ("unknown name 'q[0]'",),
+    "__import__": ("unknown name '__import__'",),
+    "q + qq": ("'qq'", "column 5 of"),
+    "  q + qq": ("'qq'", "column 7 of"),
+    "abs(q) * qq": ("'qq'", "column 10 of"),
+    "\u00e4 + q": ("'\u00e4'", "column 1 of"),
+    "abs(q, 1)": ("abs", "1", "2"),
+    "exec(q)": ("unknown function 'exec'",),
+    "sin": ("unknown name 'sin'",),
+    "sin(x=q)": ("sin", "by place"),
+    "min(*q)": ("min", "by place"),
+    "q.b(1)": ("functions by their names",),
+    "previous(time)": ("'time'", "no value before the step"),
+    "previous(q + tau)": ("previous takes one name",),
+    "q and tau": ("condition", "'x > 1'"),
+    "tau if q else 1": ("condition", "'x > 1'"),
+    "not q": ("condition", "'x > 1'"),
+    "'a'": ("'a'", "number"),
+    "1j": ("1j", "no number"),
+    "1e999": ("inf", "no number"),
+    "1 / 0": ("'1 / 0'", "no finite number", "inf"),
+    "[q]": ("list is not allowed",),
+    "lambda: 1": ("lambda",),
+    "(x := q)": ("namedexpr is not allowed",),
+    "f'{q}'": ("joinedstr is not allowed",),
+    "await q": ("await",),
+    "q\n+ tau": ("no expression",),
+    "\0": ("no expression",),
+    "(" * 300 + "q" + ")" * 300: ("no expression",),
+    "-" * 60 + "q": ("too long", "nested 40 times"),
+    "+".join(["q"] * 300): ("too long", "500 parts"),
+    "q" * 3000: ("2000", "3000"),
+}
+"""What is no expression, or cannot be computed."""
+
+
+class Expressed(fmugym.FMUEnv):
+    """A class whose config has all that hooks might tell."""
+
+    def __init__(self, **keys: Any) -> None:
+        config = {"model_input_names": "tau", "model_output_names": ["q"], "time_step": 0.02}
+        config |= {"terminated": False, "model_parameters": {"q_0": 0.0}} | keys
+        super().__init__(Path("model.fmu").absolute(), config)
+
+    def _get_action_space(self) -> spaces.Box:
+        return spaces.Box(-1.0, 1.0, (1,))
+
+
+OF_CLASSES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
+    ({"terminated": "qq > 1"}, ("config key 'terminated'", "'qq'", "did you mean 'q'")),
+    ({"terminated": "q"}, ("config key 'terminated'", "expected a condition", "got 'q'")),
+    ({"terminated": "done"}, ("'done' is known in 'reward'",)),
+    ({"terminated": "q >"}, ("'terminated': 'q >' is no expression",)),
+    ({"reward": "action[7]"}, ("unknown name 'action[7]'", "'action")),
+    ({"reward": "1", "positive_reward": 2.0}, ("'reward' and 'positive_reward' contradict",)),
+    ({"reward": {"near": {"expr": "q", "wight": 2}}}, ("'wight'", "did you mean 'weight'")),
+    ({"inputs": {"g": "1"}}, ("unknown input in 'inputs' 'g'", "'tau'")),
+    ({"inputs": {"tau": "previous(q)"}}, ("'q'", "no value before the step")),
+    ({"memory": {"n": {"start": 0, "update": "n + o"}}}, ("config key 'memory'", "name 'o'")),
+    ({"memory": {"n": {"start": 0}}}, ("'update' is missing",)),
+    (
+        {"memory": {"n": {"start": 0, "update": "1"}}, "episode_variables": {"n": 1}},
+        ("'n' is in",),
+    ),
+    ({"memory": {"q_0": {"start": 0, "update": "1"}}}, ("'q_0' is both",)),
+    ({"memory": {"pi": {"start": 0, "update": "1"}}}, ("'pi' has a name with a meaning",)),
+    ({"episode_variables": {"time": 0}}, ("'time' has a name with a meaning",)),
+    ({"costs": {"much": "sqr(q)"}}, ("unknown function 'sqr'", "did you mean 'sqrt'")),
+    ({"observations": ["q", "y"]}, ("config key 'observations'", "unknown name 'y'")),
+    ({"info": {"cost": "1"}}, ("'cost' has a meaning of its own",)),
+    ({"reward": "y", "truncated": "z > 1"}, ("'y'", "'z'")),
+)
+"""Keys of the config of a class; all of its mistakes are told at once."""
+
+
+def of_expressions() -> Iterator[Mistake]:
+    """Mistakes in the expressions of task files and of classes."""
+    for text, facts in EXPRESSIONS.items():
+        yield task({"reward": text}, *facts)
+    for keys, facts in OF_CLASSES:
+        yield python(str(keys), lambda keys=keys: Expressed(**keys), *facts)
 
 
 # Classes
@@ -488,6 +578,7 @@ GROUPS: dict[str, Callable[[], list[Mistake]]] = {
     "commands": lambda: [command(*given, facts=facts) for given, facts in COMMANDS.items()],
     "keys": lambda: list(of_keys()),
     "names": lambda: list(of_names()),
+    "expressions": lambda: list(of_expressions()),
     "files": lambda: [task(change, *facts) for change, facts in FILES],
     "config": lambda: list(of_config()),
     "calls": lambda: list(of_calls()),

@@ -291,6 +291,41 @@ MUTATIONS: Final = (
         '"previous_outputs", "previous_state", "states", _FLOAT, "output", "output", of="state"',
         "'previous(x)' is the value of x after the step",
     ),
+    Mutation(
+        "expressions",
+        "deployment/export/c_source.py",
+        '"absolute": "fabs"',
+        '"absolute": "abs"',
+        "an exported agent in C cuts the digits off 'abs(x)'",
+    ),
+    Mutation(
+        "expressions",
+        "deployment/export/c_source.py",
+        "return ((r < 0) != (b < 0)) ? r + b : r;",
+        "return (r < 0) ? r + b : r;",
+        "in C, a remainder of a negative divisor has the wrong sign",
+    ),
+    Mutation(
+        "expressions",
+        "deployment/export/c_source.py",
+        "return (a > b || a != a) ? a : b;",
+        "return (a > b) ? a : b;",
+        "in C, the maximum of a number and what is none is the number",
+    ),
+    Mutation(
+        "expressions",
+        "deployment/export/onnx_model.py",
+        '"rint": "Round"',
+        '"rint": "Floor"',
+        "an exported agent in ONNX rounds down",
+    ),
+    Mutation(
+        "expressions",
+        "deployment/export/onnx_model.py",
+        "inside = where(x < table[0], table[-2]",
+        "inside = where(x < table[0], table[-1]",
+        "in ONNX, before its first point a curve has the value after the last one",
+    ),
 )
 
 

@@ -81,7 +81,9 @@ HELPERS: Final[Mapping[str, str]] = {
     "floor_divide": (
         "{T} {name}({T} a, {T} b) {{\n    const {T} r = fmod(a, b);\n"
         "    const {T} q = (a - r) / b - ((r != 0 && (r < 0) != (b < 0)) ? 1 : 0);\n"
-        "    const {T} whole = floor(q);\n    return (q - whole > 0.5) ? whole + 1 : whole;\n}}"
+        "    const {T} whole = floor(q);\n    if (b == 0 || q == 0) {{\n"
+        "        return (b == 0) ? a / b : copysign(0, a / b);\n    }}\n"
+        "    return (q - whole > 0.5) ? whole + 1 : whole;\n}}"
     ),
     "interpolate": (
         "{T} {name}({T} x, const {T} *xs, const {T} *ys, int count) {{\n"

@@ -1,7 +1,5 @@
 """Exported agents do what the originals do: in C, in a loop with the plant."""
 
-import ctypes
-import re
 from contextlib import closing
 
 import gymnasium
@@ -10,13 +8,10 @@ import pytest
 from combinations import in_turn
 from export_tools import (
     ACTIVATIONS,
-    FUNCTIONS,
     TIMED,
     TIMES,
     acting,
     agent_named,
-    arguments_of,
-    built,
     closed_loop,
     compiled,
     differences,
@@ -31,8 +26,6 @@ from letters import wide
 import fmugym
 from fmugym import ConfigError
 from fmugym.deployment.export import Layer, Network, agent_of, write_c
-from fmugym.deployment.export.c_source import C_TYPES, HELPERS, constant, expression
-from fmugym.expressions.program import operation_of
 
 BALANCING = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.5, 10.0, 2.0]], np.float32)
 """The second action of a cart-pole is better than the first one where this feedback is positive."""
@@ -47,7 +40,6 @@ HEATING = {
     "reward": "-abs(T - 21)",
 }
 LATE = "sin(elapsed / 3600) % 0.3 + previous(T) / 50"
-POWERS = "pow(T / 30, 2) + powf(previous(T) / 30, 2)"
 PRESENT = {"actions": ["u"], "observations": ["T", "price"], "normalize": True, "rescale": True}
 SENSOR = {"delay": "30min", "noise": 0.2, "quantum": 0.5, "bias": 0.3}
 TASKS = {
@@ -72,10 +64,6 @@ TASKS = {
     "expression": {
         "expressions": {"late": {"expr": LATE, "min": 0, "max": 2}},
         "agent": PRESENT | {"observations": ["T", "late"]},
-    },
-    "powers": {
-        "expressions": {"warm": {"expr": POWERS, "min": 0, "max": 4}},
-        "agent": PRESENT | {"observations": ["T", "warm"]},
     },
 }  # fmt: skip
 
@@ -407,15 +395,6 @@ class TestExternal:
             agent_of(env, network_for(env), external=["price"])
 
 
-def test_powers_are_those_of_c(tmp_path):
-    """Not the products that numpy takes for a square."""
-    env = heating("powers")
-    write_c(agent_of(env, network_for(env, scaled=False)), tmp_path)
-    (source,) = tmp_path.glob("*.c")
-    assert {"pow(", "powf("} <= set(re.findall(r"\bpowf?\(", source.read_text()))
-    env.close()
-
-
 class TestFiles:
     def test_measurements_and_actions_have_names_and_units(self, tmp_path):
         env = made("House")
@@ -462,57 +441,6 @@ class TestFiles:
         before = controller.memory.raw
         assert controller.step([bad]) is None
         assert controller.memory.raw == before
-
-
-class TestFunctions:
-    """The functions of numpy as expressions in C."""
-
-    @pytest.mark.parametrize("letter", "df")
-    def test_of_numpy(self, letter, tmp_path):
-        helpers, lines, kind = {}, [], C_TYPES[letter]
-
-        def use(name, letter):
-            return helpers.setdefault(name, f"own_{name}")
-
-        known = [ufunc for ufunc in FUNCTIONS if operation_of(ufunc, letter)]
-        for ufunc in known:
-            text = expression(ufunc, ["x", "y"][: ufunc.nin], np.dtype(letter), use)
-            lines.append(f"double f_{ufunc.__name__}({kind} x, {kind} y) {{")
-            lines.append(f"    (void)y;\n    return (double)({text});\n}}")
-        own = [HELPERS[h].format(T=kind, name=n) for h, n in helpers.items()]
-        library = built("\n".join(["#include <math.h>", *own, *lines]), tmp_path)
-        number = ctypes.c_double if letter == "d" else ctypes.c_float
-        tolerance = 1e-13 if letter == "d" else 1e-6
-        for ufunc in known:
-            values = arguments_of(ufunc, np.dtype(letter))
-            function = library[f"f_{ufunc.__name__}"]
-            function.argtypes, function.restype = [number, number], ctypes.c_double
-            second = values[1] if ufunc.nin > 1 else np.zeros(len(values[0]))
-            found = [function(x, y) for x, y in zip(values[0], second, strict=True)]
-            with np.errstate(all="ignore"):
-                wanted = ufunc(*values).astype(float)
-            name = ufunc.__name__
-            np.testing.assert_allclose(found, wanted, rtol=tolerance, atol=tolerance, err_msg=name)
-
-    def test_others_are_refused(self):
-        with pytest.raises(ConfigError, match=r"remainder.*int64"):
-            expression(np.remainder, ["x", "y"], np.dtype(np.int64), None)
-
-    @pytest.mark.parametrize(
-        ("value", "letter"),
-        [
-            *((0.1, "d"), (1e300, "d"), (-5e-324, "d"), (np.inf, "d"), (np.nan, "d"), (-0.0, "d")),
-            *((np.float32(0.1), "f"), (np.float32(1e-45), "f"), (-np.inf, "f"), (True, "?")),
-            *((-(2**63), "q"), (2**40, "q"), (-3, "q")),
-        ],
-    )
-    def test_constants_keep_all_bits(self, value, letter, tmp_path):
-        kind, text = C_TYPES[letter], constant(value, letter)
-        includes = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>"
-        library = built(f"{includes}\n{kind} value = {text};", tmp_path)
-        dtype = np.dtype(letter)
-        found = (ctypes.c_char * dtype.itemsize).in_dll(library, "value").raw
-        assert found == np.array(value, dtype).tobytes()
 
 
 class TestNetworks:

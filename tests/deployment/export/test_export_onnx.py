@@ -9,11 +9,9 @@ import test_export_search
 from combinations import in_turn
 from export_tools import (
     ACTIVATIONS,
-    FUNCTIONS,
     Runner,
     acting,
     agent_named,
-    arguments_of,
     closed_loop,
     exported,
     made,
@@ -25,9 +23,6 @@ from test_export_search import HEAT, HEATERS, heater
 
 from fmugym import ConfigError
 from fmugym.deployment.export import agent_of, write_onnx
-from fmugym.deployment.export.onnx_model import Nodes, Operations
-from fmugym.expressions.graph import Graph
-from fmugym.expressions.program import operation_of
 from fmugym.training.search.policy import ResidualAgent
 
 onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
@@ -61,79 +56,6 @@ class TestSearch(test_export_search.Agents):
         facts = runtime.InferenceSession(str(path)).get_modelmeta().custom_metadata_map
         assert json.loads(facts["memory"])["agent_controller"] == [0.0, None]
         env.close()
-
-
-class TestFunctions:
-    @pytest.mark.parametrize("letter", "dfq")
-    def test_of_numpy(self, letter):
-        dtype = np.dtype(letter)
-        for ufunc in FUNCTIONS:
-            is_wider = ufunc is np.float_power and letter != "d"  # it computes with float64
-            if is_wider or operation_of(ufunc, letter) is None:
-                continue
-            values = arguments_of(ufunc, dtype)
-            if letter == "q" and ufunc in {np.remainder, np.floor_divide}:
-                values[1][values[1] == 0] = 3
-            with np.errstate(all="ignore"):
-                wanted = ufunc(*values)
-
-            def apply(graph, operands, ufunc=ufunc, dtype=wanted.dtype):
-                return graph.compute("ufunc", ufunc, operands, dtype, ufunc)
-
-            single = ufunc in {np.arcsin, np.arccos, np.arctan, np.arctan2}
-            tolerance = 1e-12 if letter == "d" and not single else 3e-6
-            np.testing.assert_allclose(
-                written(apply, values), wanted, rtol=tolerance, atol=tolerance, err_msg=str(ufunc)
-            )
-
-    def test_others_are_refused(self):
-        def cube_root(graph, operands):
-            return graph.compute("ufunc", np.cbrt, operands, np.dtype(np.float64), np.cbrt)
-
-        with pytest.raises(ConfigError, match=r"cbrt.*float64"):
-            written(cube_root, [np.ones(3)])
-
-    @pytest.mark.parametrize("count", [1, 2, 7])
-    def test_tables(self, count):
-        rng = np.random.default_rng(0)
-        xs, ys = np.sort(rng.normal(size=count)), rng.normal(size=count)
-
-        def look_up(graph, operands):
-            graph.tables["table"] = np.concatenate([xs, ys, [-9.0, 9.0]])
-            return graph.compute("interpolate", "table", operands, np.dtype(np.float64), None)
-
-        seen = np.concatenate([xs, rng.normal(size=50) * 2])
-        own = written(look_up, [seen])
-        assert own == pytest.approx(np.interp(seen, xs, ys, -9.0, 9.0), abs=1e-12)
-
-
-def written(operation, values):
-    """What ONNX Runtime makes of an operation of a graph."""
-    nodes, graph, dtype = Nodes(), Graph(), values[0].dtype
-    operands = tuple(graph.load("row", name, dtype) for name in "xy"[: len(values)])
-    node = operation(graph, operands)
-    result = graph.nodes[node].dtype
-    operations = Operations(nodes, graph, set(operands), "xy".__getitem__)
-    (name,) = operations.written([node])
-    made = onnx.helper.make_graph(
-        nodes.nodes,
-        "function",
-        [value_info(name, dtype) for name in "xy"[: len(values)]],
-        [value_info(name, result)],
-        nodes.tensors,
-    )
-    return run_graph(made, dict(zip("xy", values, strict=False)), name)
-
-
-def value_info(name, dtype):
-    kind = onnx.helper.np_dtype_to_tensor_dtype(dtype)
-    return onnx.helper.make_tensor_value_info(name, kind, [None])
-
-
-def run_graph(graph, values, result):
-    opset = onnx.helper.make_opsetid("", 18)
-    model = onnx.helper.make_model(graph, opset_imports=[opset], ir_version=9)
-    return runtime.InferenceSession(model.SerializeToString()).run([result], values)[0]
 
 
 class TestModel:

@@ -58,14 +58,15 @@ def test_a_hook_of_a_class_takes_the_place_of_a_formula(opened, make_envs):
 
 
 def test_a_task_that_is_too_long_for_a_program_runs_on_arrays(make_envs, caplog):
-    task = SWING | {"reward": {f"r{n}": f"sin(theta * {n}) + {n}" for n in range(3, 3500)}}
+    rows = np.arange(7200.0).reshape(90, 80)
+    terms = {f"r{row[0]:.0f}": ", ".join(f"sin(theta + {n})" for n in row) for row in rows}
+    task = SWING | {"reward": {name: f"max({values})" for name, values in terms.items()}}
     with caplog.at_level("INFO", "fmugym"):
         envs = make_envs(lambda: fmugym.load(task), 2)
     assert "more than 20000 operations" in caplog.text
     envs.reset(seed=1)
     _, rewards, *_ = envs.step(envs.action_space.sample())
-    number = np.arange(3, 3500)
-    expected = [(np.sin(one[0] * number) + number).sum() for one in envs.get_attr("state")]
+    expected = [np.sin(one[0] + rows).max(axis=1).sum() for one in envs.get_attr("state")]
     assert rewards == pytest.approx(expected)
     assert envs.task.way == "arrays"
 
