@@ -9,7 +9,6 @@ import os
 import re
 import shlex
 import shutil
-import signal
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -223,9 +222,9 @@ class TestOutput:
         if row.varies:
             pytest.skip(row.varies)
         forced = ["--force"] if row.files else []
-        first, again = cli(*row.arguments), cli(*row.arguments, *forced)
-        assert first[0] == 0
-        assert first == again
+        code, out, _ = cli(*row.arguments)
+        assert code == 0
+        assert cli(*row.arguments, *forced)[:2] == (0, out)
 
     @pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
     @all_commands
@@ -304,7 +303,6 @@ class TestRefusals:
 
 PARTNERS = {
     ("simulate", "--speed"): ("--plant",),
-    ("export", "--steps"): ("task.toml", "--surrogate"),
 }
 """Options without which a number is not looked at."""
 
@@ -378,18 +376,19 @@ class TestCtrlC:
     def test_it_ends_a_command_at_any_moment(self, part, name, row, folder, cli):
         """After so much of all calls of functions of the package."""
         forced = ["--force"] if row.files else []
-        with InterruptedCalls() as calls:
-            assert cli(*row.arguments)[0] == 0
+        assert cli(*row.arguments)[0] == 0  # which loads the modules that it needs
+        with InterruptedCalls() as whole:
+            assert cli(*row.arguments, *forced)[0] == 0
         before = contents(folder)
-        with InterruptedCalls(int(part * calls.count)) as calls:
+        with InterruptedCalls(int(part * whole.count)):
             code, _, err = cli(*row.arguments, *forced)
         assert code == 130
-        assert "Traceback" not in err
         assert "rror" not in err
+        assert "Traceback" not in err
         now = contents(folder)
-        assert [path for path in now if path not in before] == []
-        assert all(is_whole(folder / path) for path in now)
-        assert {Path(path).parts[0] for path in now} == {Path(path).parts[0] for path in before}
+        assert now.keys() <= before.keys()
+        assert {Path(path).parts[0] for path in before} == {Path(path).parts[0] for path in now}
+        assert all(now[path][-1:] == before[path][-1:] for path in now)
 
 
 class InterruptedCalls:
@@ -417,15 +416,7 @@ class InterruptedCalls:
         self.count += 1
         if self.count == self.last:
             sys.setprofile(None)
-            signal.raise_signal(signal.SIGINT)
-
-
-def is_whole(path):
-    """Whether a file is empty nowhere, and ends as its kind does."""
-    ends = {".json": b"}", ".svg": b"</svg>", ".toml": b"\n", ".csv": b"\n", ".c": b"\n"}
-    content = path.read_bytes()
-    end = ends.get(path.suffix, b"")
-    return content and (content.endswith(end) or content.rstrip().endswith(end))
+            raise KeyboardInterrupt
 
 
 class TestMistakes:
@@ -440,10 +431,11 @@ class TestMistakes:
         pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3")
         command_mistakes.require_refusal(line, facts, folder)
 
-    @pytest.mark.parametrize(("module", "line"), command_mistakes.MISSING_LIBRARIES.items())
-    def test_a_library_that_is_missing_names_its_extra(self, module, line, folder, monkeypatch):
-        needed, _, extra = module.partition(" of ")
-        if "--algorithm" in line and needed != "stable_baselines3" and not find_spec("torch"):
+    @pytest.mark.parametrize(("line", "library"), command_mistakes.MISSING_LIBRARIES.items())
+    def test_a_library_that_is_missing_names_its_extra(self, line, library, folder, monkeypatch):
+        """Before anything is played for what it would make."""
+        module, extra = library
+        if "--algorithm" in line and extra != "sb3" and not find_spec("stable_baselines3"):
             pytest.skip("needs the extra test-sb3")
-        monkeypatch.setitem(sys.modules, needed, None)
+        monkeypatch.setitem(sys.modules, module, None)
         command_mistakes.require_refusal(line, (f".[{extra}]",), folder)

@@ -190,14 +190,17 @@ OF_ALGORITHMS: Final[Mapping[str, Facts]] = {
 }
 """Of trainings with Stable-Baselines3, by arguments of ``train``."""
 
-MISSING_LIBRARIES: Final[Mapping[str, str]] = {
-    "matplotlib of plot": "simulate task.toml --output a.html",
-    "stable_baselines3 of sb3": f"{_TRAIN} {_PPO}",
-    "optuna of tune": f"{_TRAIN} {_PPO} --tune 2",
-    "mlflow of mlflow": f"{_TRAIN} {_PPO} --track mlflow",
-    "wandb of wandb": f"{_TRAIN} {_PPO} --track wandb",
+MISSING_LIBRARIES: Final[Mapping[str, tuple[str, str]]] = {
+    "simulate task.toml --output a.html": ("matplotlib", "plot"),
+    "evaluate task.toml --plot a.png": ("matplotlib", "plot"),
+    "fit task.toml --log log.csv --parameter l --plot a.svg": ("matplotlib", "plot"),
+    "simulate task.toml --output minari:a/b-v0": ("fmugym.records.minari", "minari"),
+    f"{_TRAIN} --algorithm PPO": ("fmugym.training.sb3", "sb3"),
+    f"{_TRAIN} {_PPO} --tune 2": ("optuna", "tune"),
+    f"{_TRAIN} {_PPO} --track mlflow": ("mlflow", "mlflow"),
+    f"{_TRAIN} {_PPO} --track wandb": ("wandb", "wandb"),
 }
-"""Commands by the library that is missing and the extra that brings it."""
+"""By a command, the module that is missing, and the extra that brings it."""
 
 
 def make_folder(folder: Path) -> None:
