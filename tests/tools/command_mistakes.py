@@ -39,9 +39,11 @@ PID_OF_Q: Final = "pid of=q setpoint=1"
 PID_OF_T: Final = "pid of=T setpoint=20..22"
 
 TASK: Final = mistakes.TASK | {
-    "controllers": {"still": f"{PID_OF_Q} kp=0.001", "wide": f"{PID_OF_Q} kp=0.1..1"}
-    | {"ahead": "mpc horizon=0.2s"},
+    "controllers": {"still": f"{PID_OF_Q} kp=0.001"},
     "agent": {"actions": ["tau"], "observations": ["q", "q_dot"]},
+}
+RANGES: Final = TASK | {
+    "controllers": {"still": 0, "wide": f"{PID_OF_Q} kp=0.1..1", "ahead": "mpc horizon=0.2s"}
 }
 
 MISTAKES: Final[Mapping[str, Facts]] = {
@@ -90,7 +92,7 @@ MISTAKES: Final[Mapping[str, Facts]] = {
     "simulate task.toml --controller 'pit of=q'": ("'pit'",),
     "simulate task.toml --controller 'pid of=qq setpoint=1 kp=1'": ("'qq'", "'q'"),
     "simulate task.toml --controller 'pid of=q setpont=1'": ("'setpont'", "'setpoint'"),
-    "simulate task.toml --controller wide": ("kp=0.1..1 is a range",),
+    "simulate ranges.toml --controller wide": ("kp=0.1..1 is a range",),
     "simulate task.toml --agent nowhere": ("'nowhere'", "fmugym train"),
     "simulate task.toml --scenario forst": ("'forst'",),
     "simulate task.toml --output no/run.csv": ("no/run.csv", "'no'"),
@@ -118,11 +120,11 @@ MISTAKES: Final[Mapping[str, Facts]] = {
     f"tune fmugym/House-v0 '{PID_OF_T} kp=5..0.05'": ("5..0.05",),
     f"tune fmugym/House-v0 '{PID_OF_T}'": ("'kp'",),
     "tune fmugym/House-v0 'schedule 06:00=0..1'": ("hysteresis, pid",),
-    "tune task.toml wide --candidates 7": ("candidates", "8", "7"),
-    "tune task.toml wide --rounds 0": ("--rounds", "positive", "0"),
-    "tune task.toml wide --output a.json": ("'a.json'", ".toml"),
-    "tune task.toml wide --output a.toml --name 'a b'": ("'a b'", "'tuned'"),
-    "tune task.toml wide --output missing/a.toml": ("missing/a.toml", "'missing'"),
+    "tune ranges.toml wide --candidates 7": ("candidates", "8", "7"),
+    "tune ranges.toml wide --rounds 0": ("--rounds", "positive", "0"),
+    "tune ranges.toml wide --output a.json": ("'a.json'", ".toml"),
+    "tune ranges.toml wide --output a.toml --name 'a b'": ("'a b'", "'tuned'"),
+    "tune ranges.toml wide --output missing/a.toml": ("missing/a.toml", "'missing'"),
     f"tune fmugym/House-v0 '{PID_OF_T} kp=1' --scenario frst": ("'frst'", "'frost'"),
     # train, which searches
     "train task.toml --output agent gamma=0.9": ("KEY=VALUE", "--algorithm"),
@@ -153,7 +155,7 @@ MISTAKES: Final[Mapping[str, Facts]] = {
     "export --task task.toml --output a.c": ("AGENT", "--controller"),
     "export x --controller still --task task.toml --output a.c": ("AGENT", "--controller"),
     "export --controller still --output a.c": ("--task",),
-    "export --controller wide --task task.toml --output a.c": ("kp=0.1..1",),
+    "export --controller wide --task ranges.toml --output a.c": ("kp=0.1..1",),
     "export task.toml --surrogate --output twin.c": ("'twin.c'", ".fmu"),
     "export --surrogate --output twin.fmu": ("--surrogate", "needs a task"),
     "export task.toml --surrogate --steps 0 --output twin.fmu": ("--steps", "positive", "0"),
@@ -178,7 +180,7 @@ OF_ALGORITHMS: Final[Mapping[str, Facts]] = {
     f"{_TRAIN} --algorithm PPO n_steps=64": ("128 steps (n_steps=64 in 2 environments)",),
     f"{_TRAIN} --algorithm PPO --resume": ("agent", "no training to resume"),
     f"{_TRAIN} --residual stil {_SAC}": ("'stil'", "'still'"),
-    f"{_TRAIN} --residual ahead {_SAC}": ("plans ahead",),
+    f"{_TRAIN.replace('task', 'ranges')} --residual ahead {_SAC}": ("plans ahead",),
     f"{_TRAIN} --residual still --residual-scale 1.5 {_SAC}": ("at most 1, got 1.5",),
     f"{_TRAIN} --residual-scale 0.5 {_SAC}": ("--residual NAME",),
     f"{_TRAIN} --residual still --algorithm DQN": ("DQN cannot be made",),
@@ -207,6 +209,7 @@ def make_folder(folder: Path) -> None:
     """What users have beside them: FMUs and tasks, right and wrong."""
     mistakes.make_folder(folder)
     (folder / "task.toml").write_text(tomlkit.dumps(TASK))
+    (folder / "ranges.toml").write_text(tomlkit.dumps(RANGES))
     (folder / "log.csv").write_text(log())
     (folder / "wrong.toml").write_text(tomlkit.dumps(TASK | {"reward": "-abs(p)"}))
     for ending in ("fmu", "toml"):
