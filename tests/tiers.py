@@ -124,6 +124,7 @@ WITHOUT_EXTENSION = {
 """Modules that run where the C extension was not built, but for tests with ``engine``."""
 
 EVERY = {
+    "test_commands": 5,
     "test_golden_tasks": 8,
     "test_hostile_archive": 19,
     "test_pool": 7,
@@ -136,6 +137,7 @@ EVERY_OF_OTHERS = 61
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_commands": 1,
     "test_golden_tasks": 1,
     "test_export_search": 3,
     "test_declared_physical": 3,
@@ -251,7 +253,10 @@ SLOW_TESTS = (
     "test_clock_shift.py::test_a_shift",
     "test_native_pool.py::TestIsolation",
     "test_formula_programs.py::test_a_task_that_is_too_long",
-    "test_cli_names.py::test_commands_and_options",
+    "test_commands.py::TestHelp::test_shells",
+    "test_commands.py::TestCtrlC::test_it_ends_a_command_at_any_moment[0.3",
+    "test_commands.py::TestCtrlC::test_it_ends_a_command_at_any_moment[0.9",
+    "test_cli_training.py::TestTrain::test_an_agent_learns",
 )
 """Others, by the beginning of their node ids."""
 

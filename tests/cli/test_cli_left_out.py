@@ -178,10 +178,6 @@ class TestPlayers:
         assert "random" in out
         assert err.count("a decision took") == 1
 
-    def test_a_mistake_of_the_only_one_is_told_before_anybody_plays(self, written, cli):
-        code, out, err = cli("evaluate", written(TWO), "--controller", "thermostat")
-        assert (code, out, err.count("\n")) == (1, "", 1)
-
     def test_simulate_writes_its_files(self, written, tmp_path, cli, late):
         players = "--controller", "planner", "--controller", "thermostat"
         output = "--output", tmp_path / "report.html"

@@ -15,7 +15,6 @@ from letters import wide
 import fmugym
 from fmugym import __main__ as program
 from fmugym.cli import episode_commands
-from fmugym.cli.command_line import _parsed
 from fmugym.records import TimeSeries
 from fmugym.records.evaluation import Score, plot_scores
 
@@ -79,10 +78,6 @@ class TestRecord:
         assert ("enough" in err) == (code == 1)
         assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
         assert "stopped" in (tmp_path / "a.html").read_text(encoding="utf-8")
-
-    def test_without_matplotlib_the_extra_is_named(self, tmp_path, refused, monkeypatch):
-        monkeypatch.setitem(sys.modules, "matplotlib", None)
-        assert ".[plot]" in refused("simulate", CART_POLE, "--output", tmp_path / "a.html")
 
 
 class TestEvaluate:
@@ -234,20 +229,6 @@ class TestJson:
         else:
             assert facts["task"] == tomllib.loads(text)
             assert any("reward" in note for note in facts["notes"])
-
-    def test_all_commands_have_it(self, commands, help_of):
-        assert {"info", "new", "train"} <= commands
-        for name in commands:
-            assert "--json" in help_of(name), name
-
-
-def test_arguments_of_an_algorithm_may_stand_anywhere():
-    found = _parsed(["train", "a.toml", "x=1", "--output", "b", "y=2", "z"])
-    assert found.arguments == ["x=1", "y=2", "z"]
-    for wrong in (["simulate", "a.toml", "y=2"], ["train", "a", "--output", "b", "--y", "c"]):
-        with pytest.raises(SystemExit) as caught:
-            _parsed(wrong)
-        assert caught.value.code == 2
 
 
 class TestInterruption:

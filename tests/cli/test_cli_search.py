@@ -457,43 +457,6 @@ class TestOutput:
         assert one["rewards"] == {"early": [-10.0] * 3, "late": [-30.0] * 3}
         assert one["total_reward"] == -40.0
 
-    @pytest.mark.parametrize(
-        ("arguments", "facts"),
-        [
-            (["gamma=0.9"], ["KEY=VALUE", "--algorithm"]),
-            (["--no-normalize"], ["--no-normalize", "--algorithm"]),
-            (["--tune", "3"], ["--tune", "--algorithm"]),
-            (["--tune-steps", "3"], ["--tune-steps", "--algorithm"]),
-            (["--record", "*"], ["--record", "--algorithm"]),
-            (["--record-env", "1"], ["--record-env", "--algorithm"]),
-            (["--record-every", "1"], ["--record-every", "--algorithm"]),
-            (["--record-format", "csv"], ["--record-format", "--algorithm"]),
-            (["--track", "wandb"], ["--track", "--algorithm"]),
-            (["--algorithm", "PPO", "--minutes", "2"], ["--minutes", "without --algorithm"]),
-            (["--algorithm", "PPO", "--rounds", "2"], ["--rounds", "without --algorithm"]),
-            (["--minutes", "0"], ["--minutes"]),
-            (["--minutes", "nan"], ["--minutes"]),
-            (["--rounds", "0"], ["--rounds"]),
-            (["--steps", "-3"], ["--steps"]),
-            (["--envs", "0"], ["--envs"]),
-            (["--seed", "-1"], ["seed"]),
-        ],
-        ids=lambda one: " ".join(one),
-    )
-    def test_mistakes(self, arguments, facts, task, tmp_path, cli):
-        code, out, err = cli("train", task, "--output", tmp_path / "a", *arguments)
-        assert (code, out, err.count("\n")) == (1, "", 1)
-        for fact in facts:
-            assert fact in err
-        assert not (tmp_path / "a").exists()
-
-    def test_a_task_that_no_search_can_take(self, tmp_path, searched):
-        path = written(tmp_path, reward=None)
-        code, _, err = searched(path, tmp_path / "a", "--rounds", "3")
-        assert (code, err.count("\n")) == (1, 1)
-        assert "reward" in err
-        assert not (tmp_path / "a").exists()
-
 
 class TestAgents:
     def test_all_who_play_take_them(self, whole, task, tmp_path, ran):
@@ -514,11 +477,6 @@ class TestAgents:
         score = json.loads(ran("evaluate", task, *options))["scores"][1]
         assert score["rewards"] == told["rewards"]["unseen episodes"]
         assert score["mean_cost"] == pytest.approx(told["mean_costs"]["effort"])
-
-    def test_a_controller_with_a_range_plays_nowhere(self, task, cli):
-        code, _, err = cli("simulate", task, "--controller", "pi")
-        assert (code, err.count("\n")) == (1, 1)
-        assert "kp=-2..-0.01 is a range" in err
 
 
 def told(limits=(), **returns):

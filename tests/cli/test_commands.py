@@ -5,6 +5,7 @@ with the files that ``folder`` makes. ``command_mistakes.py`` has the table of m
 """
 
 import json
+import logging
 import os
 import re
 import shlex
@@ -83,9 +84,30 @@ COMMANDS = {
     "bench": Command("bench task.toml --envs 2 --seconds 0.01", varies="it measures times"),
 }
 
+ENDS = ("fails", "is odd", "now")
+PROGRAM = "import sys; from fmugym.__main__ import main; sys.exit(main())"
+CHATTY = """
+import logging
+from fmugym.envs import CartPoleEnv
+
+class Chatty(CartPoleEnv):
+    def __init__(self):
+        super().__init__()
+        logger = logging.getLogger("fmugym.chatty")
+        for number in range(10):
+            logger.warning("0: environment %d fails", number)
+        for number in range(2):
+            logger.warning("1: number %d is odd", number)
+        logger.info("I speak now")
+        logger.error("E: an error now")
+"""
+
 all_commands = pytest.mark.parametrize("name", COMMANDS)
 commands_that_write = pytest.mark.parametrize(
     "name", [name for name, one in COMMANDS.items() if one.files]
+)
+commands_that_repeat = pytest.mark.parametrize(
+    "name", [name for name, one in COMMANDS.items() if not one.varies]
 )
 
 
@@ -216,11 +238,9 @@ class TestOutput:
         assert loud[0] == 0
         assert row.varies or loud[1] == out
 
-    @all_commands
+    @commands_that_repeat
     def test_the_same_arguments_print_the_same(self, name, row, cli):
         """Seeds have defaults, so that nothing depends on chance."""
-        if row.varies:
-            pytest.skip(row.varies)
         forced = ["--force"] if row.files else []
         code, out, _ = cli(*row.arguments)
         assert code == 0
@@ -237,6 +257,45 @@ class TestOutput:
             assert run_command_line([*row.arguments, "-q"]) == 0
         assert capsys.readouterr().err == ""
         assert all((folder / file).exists() for file in row.files)
+
+    @pytest.mark.parametrize(
+        ("options", "told"), [([], "000 11 E"), (["-v"], "0000000000 11 IE"), (["-q"], "E")]
+    )
+    def test_three_warnings_of_a_kind_are_told(self, options, told, folder, cli, monkeypatch):
+        """A line says how many are left out; the logger is then as before."""
+        (folder / "chatty.py").write_text(CHATTY)
+        logger = logging.getLogger("fmugym")
+        before = logger.handlers[:], logger.level
+        code, _, err = cli("simulate", "chatty:Chatty", "--steps", 1, *options)
+        assert code == 0
+        lines = err.splitlines()
+        said = [
+            "".join(line[0] for line in lines if line.endswith(end)) for end in ("fails", "odd")
+        ]
+        rest = "".join(line[0] for line in lines if line.endswith("now"))
+        assert [one for one in (*said, rest) if one] == told.split()
+        assert ("7 more warnings of these kinds; -v shows them" in err) == (not options)
+        assert (logger.handlers, logger.level) == before
+        sys.modules.pop("chatty")
+
+    def test_arguments_of_an_algorithm_may_stand_anywhere(self):
+        """But not those of other commands."""
+        line = "train task.toml x=1 --output made --algorithm PPO y=2 z"
+        assert "'z'" in command_mistakes.refusal(*line.split(), code=1)
+        for wrong in ("simulate task.toml y=2", "train task.toml --output made --y c"):
+            command_mistakes.refusal(*wrong.split(), code=2)
+
+    @pytest.mark.parametrize("program", [["-m", "fmugym"], ["-c", PROGRAM]])
+    def test_classes_in_the_working_directory_are_found(self, program, folder):
+        """The program ``fmugym`` has its own folder in front, not the working directory."""
+        text = "from fmugym.envs import CartPoleEnv\n\n\nclass Cart(CartPoleEnv):\n    pass\n"
+        (folder / "cart.py").write_text(text)
+        command = "-P" if "-c" in program else "-B", *program, "simulate", "cart:Cart"
+        done = run_python(*command, "--steps", 3, cwd=folder)
+        assert "reward 3 in 3 steps" in done.stdout, done.stderr
+        failed = run_python(*command[:-1], "absent.toml", cwd=folder)
+        assert (failed.returncode, failed.stdout) == (1, "")
+        assert is_one_line(failed.stderr)
 
 
 class TestRefusals:
@@ -353,7 +412,7 @@ class TestOldFiles:
     def test_it_stays_if_no_new_one_comes(self, wrong, name, row, folder, cli):
         before = contents(folder)
         target = f"{wrong}{Path(row.target).suffix}"
-        code, out, err = cli(*row.of(target), "--force")
+        code, out, err = cli(*row.of(target), "--force", "-q")
         assert (code, out) == (1, "")
         assert is_one_line(err), err
         assert contents(folder) == before
