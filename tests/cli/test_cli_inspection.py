@@ -1,4 +1,4 @@
-"""The command line: what it says of FMUs, and that the skeletons it writes run."""
+"""Commands ``info`` and ``new``: what they say of FMUs and data, and that what they write runs."""
 
 import json
 import re
@@ -12,7 +12,7 @@ import makers
 import pytest
 import quirk_table
 import zoo_tools
-from fmu_tools import library_name, probe_fmu, read_fmu
+from fmu_tools import edited_fmu, library_name, probe_fmu, read_fmu
 from plants import ONCE
 from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
@@ -466,3 +466,107 @@ class TestCommand:
             made = tmp_path / f"made{len(kind)}"
             ran("new", path, *kind, "--output", made)
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")
+
+
+class TestTasks:
+    @pytest.mark.parametrize(("model", "version"), ONCE)
+    def test_what_it_writes_passes_validate(self, model, version, tmp_path, cli):
+        path = tmp_path / "task.toml"
+        fmu = fmugym.bundled_fmu(model, version)
+        code, out, err = cli("new", fmu, "--output", path)
+        assert (code, out) == (0, "")
+        assert "reward and set point are guesses" in err
+        code, out, err = cli("validate", path, "--json")
+        findings = json.loads(out)["findings"]
+        assert (code, err) == (0, "")
+        bad = {finding["check"] for finding in findings if finding["verdict"] != "ok"}
+        # sizes of temperatures and powers differ, nothing writes the weather, and the FMU's default
+        # experiment is shorter than the time constant of its walls
+        of_house = {"inputs", "observations", "length"}
+        assert bad <= (of_house if model == "House" else {"observations"})
+
+    def test_names_that_are_no_names_of_python(self, tmp_path, ran, load):
+        odd = {'name="tau"': 'name="a.b[1] &quot;x&quot;\\ \u00e4"', 'name="q"': 'name="step"'}
+        fmu = edited_fmu(fmugym.bundled_fmu("Pendulum"), tmp_path, odd)
+        out = ran("new", fmu)
+        assert out.isascii()
+        env = load(tomllib.loads(out))
+        assert env.config.model_input_names == ('a.b[1] "x"\\ \u00e4',)
+        assert "step" in env.config.model_output_names
+
+    def test_the_path_of_an_fmu_below_the_file_is_relative(self, tmp_path, cli):
+        (tmp_path / "fmus").mkdir()
+        fmu = tmp_path / "fmus" / "Pendulum.fmu"
+        fmu.write_bytes(fmugym.bundled_fmu("Pendulum").read_bytes())
+        cli("new", fmu, "--output", tmp_path / "task.toml")
+        assert 'fmu = "fmus/Pendulum.fmu"' in (tmp_path / "task.toml").read_text()
+        fmugym.load(tmp_path / "task.toml").close()
+
+
+DATA = """
+fmu = { bundled = "Pendulum" }
+time_step = "1h"
+clock = "03-01"
+reward = "-p"
+[data]
+p = { file = "prices.csv", column = "p", interpolation = "previous", timezone = "Europe/Berlin" }
+q = { file = "prices.csv", column = 3, gaps = "3h", timezone = "Europe/Berlin" }
+[agent]
+actions = ["tau"]
+observations = ["p", "q", "q_dot"]
+[variables]
+tau = { min = -1, max = 1 }
+"""
+
+
+@pytest.fixture
+def task(tmp_path):
+    hours = [*range(3), *range(3, 24)]
+    rows = [f"2024-10-27 {hour:02d}:00;{hour},5;{hour if hour != 9 else ''}" for hour in hours]
+    rows.insert(3, "2024-10-27 02:00;2,75;2")
+    (tmp_path / "prices.csv").write_text("\n".join(["time;p;q", *rows, ""]), encoding="utf-8")
+    (tmp_path / "task.toml").write_text(DATA, encoding="utf-8")
+    return tmp_path / "task.toml"
+
+
+def test_info_says_once_how_a_file_was_read(ran, task):
+    lines = ran("info", task).partition("\nData\n")[2].splitlines()
+    assert [line for line in lines if "prices.csv:" in line] == lines[1:2]
+    for fact in ("semicolons", "25 rows", "2024-10-27 23:00", "3600 s", "+01:00, +02:00", "Berlin"):
+        assert fact in lines[1]
+    assert lines[0].strip() == "standard time: +01:00 (the smallest offset in prices.csv)"
+    assert "decimal commas" in lines[2]
+    assert "1 values missing" in lines[3]
+    assert "7200 s" in lines[3]
+
+
+def test_info_as_json(ran, task):
+    data = json.loads(ran("info", task, "--json"))["data"]
+    assert data["standard_time"].startswith("+01:00")
+    first, second = data["series"]
+    assert (first["rows"], first["decimal_commas"], first["missing"]) == (25, True, 0)
+    assert (second["column"], second["missing"], second["longest_gap"]) == ("q", 1, 7200)
+
+
+def test_info_says_what_is_wrong_and_of_an_fmu_nothing(ran, task):
+    task.write_text(DATA.replace("prices", "prises", 1), encoding="utf-8")
+    out = ran("info", task)
+    assert "unknown file 'prises.csv'; did you mean 'prices.csv'?" in out
+    task.write_text(DATA.partition("[data]")[0] + DATA[DATA.index("[agent]") :], encoding="utf-8")
+    assert "\nData" not in ran("info", task)
+
+
+class TestJson:
+    @pytest.mark.parametrize("options", [[], ["--class"]])
+    def test_of_new(self, options, tmp_path, cli):
+        fmu = fmugym.bundled_fmu("Pendulum")
+        path = tmp_path / "out"
+        code, out, err = cli("new", fmu, *options, "--output", path, "--json")
+        facts = json.loads(out)
+        assert (code, err, facts["output"]) == (0, "", str(path))
+        text = path.read_text()
+        if options:
+            assert facts["program"] == text
+        else:
+            assert facts["task"] == tomllib.loads(text)
+            assert any("reward" in note for note in facts["notes"])
