@@ -12,7 +12,6 @@ from fmu_tools import interrupted_after
 from letters import wide
 
 import fmugym
-from fmugym import __main__ as program
 from fmugym.cli import episode_commands
 from fmugym.records import TimeSeries
 from fmugym.records.evaluation import Score, plot_scores
@@ -224,18 +223,6 @@ class TestInterruption:
         monkeypatch.setattr(fmugym.FMUVectorEnv, "step", interrupted)
         code, out, _ = cli("bench", CART_POLE, "--seconds", "0.01", "--json")
         assert (code, [one["envs"] for one in json.loads(out)["speeds"]]) == (130, [0])
-
-    def test_while_modules_are_loaded(self, monkeypatch):
-        def interrupted(*_, **__):
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(program, "end_as_after_ctrl_c", lambda: None)
-        monkeypatch.delitem(sys.modules, "fmugym.cli.command_line")
-        monkeypatch.delattr("fmugym.cli.command_line", raising=False)
-        monkeypatch.setattr("builtins.__import__", interrupted)
-        code = program.main()
-        monkeypatch.undo()
-        assert code == 130
 
 
 TASK = {

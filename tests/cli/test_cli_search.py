@@ -50,19 +50,12 @@ def task(tmp_path):
     return written(tmp_path)
 
 
-def test_a_folder_is_replaced_only_by_force_and_only_by_a_new_agent(task, tmp_path, searched):
+def test_only_the_folder_of_a_training_is_replaced_and_only_by_a_new_agent(
+    task, tmp_path, searched
+):
+    """A search that time ends before it has found anything is no agent."""
     folder = tmp_path / "agent"
-    short = "--rounds", "3"
-    assert searched(task, folder, *short)[0] == 0
-    before = facts_of(folder)
-    code, _, err = searched(task, folder, *short, "--seed", "9")
-    assert (code, "--force" in err) == (1, True)
-    wrong = written(tmp_path, "wrong", reward="-abs(qq)")
-    assert searched(wrong, folder, *short, "--force")[0] == 1
-    assert facts_of(folder) == before
-    assert searched(task, folder, *short, "--seed", "9", "--force")[0] == 0
-    assert facts_of(folder) != before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent", "task.toml", "wrong.toml"]
+    assert searched(task, folder, "--rounds", "3")[0] == 0
     before = facts_of(folder)
     few = written(tmp_path, "few", controllers={"pi": TASK["controllers"]["pi"]})
     for output in (folder, tmp_path / "none"):
