@@ -154,6 +154,7 @@ class TestHelp:
 
     @all_commands
     def test_it_is_printed_and_has_the_common_options(self, name, row, capsys):
+        """With ``--force`` where files are written; ``info`` does so for repairs and datasets."""
         with pytest.raises(SystemExit) as caught:
             run_command_line([name, "--help"])
         out, err = capsys.readouterr()
