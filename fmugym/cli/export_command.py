@@ -119,9 +119,9 @@ def _export(arguments: argparse.Namespace) -> None:
         )
     new_file(output)
     if arguments.plot is not None:
-        require_picture(arguments.plot)
         if not arguments.surrogate:
             raise ConfigError("--plot shows a surrogate: give --surrogate")
+        require_picture(arguments.plot)
     if arguments.surrogate:
         agent = _surrogate(arguments)
         _show(agent, _written(agent, output, arguments), arguments)
