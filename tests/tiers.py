@@ -13,7 +13,6 @@ SLOW_MODULES = {
     "test_benchmarks",
     "test_call_order",
     "test_cli_advice",
-    "test_cli_controllers",
     "test_cli_docs",
     "test_cli_residual",
     "test_cli_resume",
@@ -126,6 +125,7 @@ WITHOUT_EXTENSION = {
 
 EVERY = {
     "test_expressions": 5,
+    "test_commands": 5,
     "test_golden_tasks": 8,
     "test_hostile_archive": 19,
     "test_pool": 7,
@@ -138,6 +138,7 @@ EVERY_OF_OTHERS = 61
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_commands": 1,
     "test_golden_tasks": 1,
     "test_expressions": 1,
     "test_exported_expressions": 1,
@@ -252,13 +253,17 @@ SLOW_TESTS = (
     "test_other_makers.py::test_vector[pythonfmu",
     "test_other_makers.py::test_who_calls_python",
     "test_other_makers.py::test_single[pythonfmu",
-    "test_cli.py::TestSkeleton",
+    "test_cli_inspection.py::TestSkeleton",
     "test_executable.py::TestMissingLibraries",
     "test_process_border.py",
     "test_clock_shift.py::test_a_shift",
     "test_native_pool.py::TestIsolation",
     "test_formula_programs.py::test_a_task_that_is_too_long",
-    "test_cli_names.py::test_commands_and_options",
+    "test_cli_validate.py::test_",
+    "test_commands.py::TestHelp::test_shells",
+    "test_commands.py::TestCtrlC::test_it_ends_a_command_at_any_moment[0.3",
+    "test_commands.py::TestCtrlC::test_it_ends_a_command_at_any_moment[0.9",
+    "test_cli_training.py::TestTrain::test_an_agent_learns",
 )
 """Others, by the beginning of their node ids."""
 
@@ -266,8 +271,8 @@ EXHAUSTIVE_TESTS = (
     "test_baselines_mpc.py::TestCommandLine::test_a_report",
     "test_baselines_tuning.py::test_it_finds",
     "test_benchmarks.py::test_tables",
-    "test_cli.py::TestSkeleton::test_paths",
-    "test_cli.py::TestSkeleton::test_runs_for",
+    "test_cli_inspection.py::TestSkeleton::test_paths",
+    "test_cli_inspection.py::TestSkeleton::test_runs_for",
     "test_cli_docs.py::test_examples_of_commands_run[evaluate1",
     "test_cli_residual.py::TestTraining::test_it_goes_on",
     "test_cli_search.py::TestCourse::test_a_search_that_time",

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from fmugym.checks import Spellings, number_of
+from fmugym.checks import Spellings, check_number
 from fmugym.cli.minari_datasets import (
     add_of_datasets,
     add_timezone,
@@ -123,11 +123,10 @@ def bench(
         After each measurement a report with all speeds until then.
 
     Raises:
-        ConfigError: If ``seconds`` is not positive.
+        ConfigError: If ``seconds`` is not positive and finite.
         FMUGymError: If an environment cannot be made, or fails.
     """
-    if number_of("--seconds", seconds) <= 0:
-        raise ConfigError(f"--seconds must be positive, got {seconds:g}")
+    check_number("--seconds", seconds, positive=True)
     load: float | None = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     with closing(make_env()) as env:
         time_step = env.pool_spec.time_step

@@ -111,6 +111,7 @@ def add_export(commands: Commands) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
+    check_counts(arguments, "steps")
     output: Path = arguments.output
     if output.suffix not in _ENDINGS:
         raise ConfigError(
@@ -118,9 +119,9 @@ def _export(arguments: argparse.Namespace) -> None:
         )
     new_file(output)
     if arguments.plot is not None:
-        require_picture(arguments.plot)
         if not arguments.surrogate:
             raise ConfigError("--plot shows a surrogate: give --surrogate")
+        require_picture(arguments.plot)
     if arguments.surrogate:
         agent = _surrogate(arguments)
         _show(agent, _written(agent, output, arguments), arguments)
@@ -150,7 +151,6 @@ def _surrogate(arguments: argparse.Namespace) -> ExportedAgent:
         raise ConfigError(f"a surrogate is an FMU: expected a file that ends in .fmu, got {name}")
     if arguments.agent is None:
         raise ConfigError("--surrogate needs a task: fmugym export task.toml --surrogate ...")
-    check_counts(arguments, "steps")
     make_env = partial(maker_of(str(arguments.agent)), physical=True)
     check_name(arguments.output.stem)
     with closing(make_env()) as env:

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from fmugym.environment.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.extras import imported
 from fmugym.records.html_report import write_report
 from fmugym.records.plots import plot
 from fmugym.records.series_recorder import RecordSeries
@@ -28,19 +29,23 @@ def require_picture(path: Path) -> None:
     """Refuse a file for a picture before any episode is played for it.
 
     Raises:
-        ConfigError: If its name tells no format of pictures.
+        ConfigError: If its name tells no format of pictures, or Matplotlib is missing.
     """
     _require_ending(path, _PICTURES)
+    imported("matplotlib", "plot")
 
 
 def require_format(path: Path, runs: int) -> None:
     """Refuse a file before any episode is played for it.
 
     Raises:
-        ConfigError: If its name tells no known format, or a table cannot hold so many runs.
+        ConfigError: If its name tells no known format, a table cannot hold so many runs, or
+            Matplotlib is missing for a picture.
     """
     _require_ending(path, (*_TABLES, *_PICTURES, _REPORT))
-    if path.suffix.lower() in _TABLES and runs > 1:
+    if path.suffix.lower() not in _TABLES:
+        imported("matplotlib", "plot")
+    elif runs > 1:
         raise ConfigError(f"{shown(str(path))} holds one run, got {runs}; a report holds several")
 
 

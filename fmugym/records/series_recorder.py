@@ -118,7 +118,7 @@ def _steps_of(every: float | None, time_step: float) -> int:
     if every is None:
         return 1
     steps = whole_number_of_steps(number_of("every", every), time_step)
-    if not steps:
+    if steps is None or steps < 1:
         raise ConfigError(
             f"every must be a multiple of the time step of {time_step:g} s, got {every:g} s"
         )

@@ -69,15 +69,3 @@ def write_system(path):
     house = fmugym.bundled_fmu("House")
     wires = ["first.T_air -> second.T_out"]
     ssp_tools.write(fmugym.FMUSystem({"first": house, "second": house}, wires), path)
-
-
-def test_every_command_has_an_example_or_a_link(commands):
-    shown = {shlex.split(command)[1] for block in BLOCKS for command in lines_of(block)}
-    listed = set(re.findall(r"^\| \[?`([\w-]+)`", PAGE, re.M)) & commands
-    assert listed == commands
-    assert commands - shown == {"serve"}  # on pages of their own
-
-
-def test_exit_codes_are_documented():
-    told = re.findall(r"^\| (\d+(?:, \d+)*) \|", PAGE, re.M)
-    assert told == ["0", "1", "2", "130, 143, 129"]

@@ -1,10 +1,9 @@
-"""The commands that play episodes: record, evaluate with several scenarios, bench."""
+"""Commands that play episodes: ``simulate``, ``evaluate``, ``bench``."""
 
 import csv
 import json
 import re
 import sys
-import tomllib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,9 +12,7 @@ from fmu_tools import interrupted_after
 from letters import wide
 
 import fmugym
-from fmugym import __main__ as program
 from fmugym.cli import episode_commands
-from fmugym.cli.command_line import _parsed
 from fmugym.records import TimeSeries
 from fmugym.records.evaluation import Score, plot_scores
 
@@ -79,10 +76,6 @@ class TestRecord:
         assert ("enough" in err) == (code == 1)
         assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
         assert "stopped" in (tmp_path / "a.html").read_text(encoding="utf-8")
-
-    def test_without_matplotlib_the_extra_is_named(self, tmp_path, refused, monkeypatch):
-        monkeypatch.setitem(sys.modules, "matplotlib", None)
-        assert ".[plot]" in refused("simulate", CART_POLE, "--output", tmp_path / "a.html")
 
 
 class TestEvaluate:
@@ -220,36 +213,6 @@ class TestProgress:
         assert (code, err) == (0, "")
 
 
-class TestJson:
-    @pytest.mark.parametrize("options", [[], ["--class"]])
-    def test_of_new(self, options, tmp_path, cli):
-        fmu = fmugym.bundled_fmu("Pendulum")
-        path = tmp_path / "out"
-        code, out, err = cli("new", fmu, *options, "--output", path, "--json")
-        facts = json.loads(out)
-        assert (code, err, facts["output"]) == (0, "", str(path))
-        text = path.read_text()
-        if options:
-            assert facts["program"] == text
-        else:
-            assert facts["task"] == tomllib.loads(text)
-            assert any("reward" in note for note in facts["notes"])
-
-    def test_all_commands_have_it(self, commands, help_of):
-        assert {"info", "new", "train"} <= commands
-        for name in commands:
-            assert "--json" in help_of(name), name
-
-
-def test_arguments_of_an_algorithm_may_stand_anywhere():
-    found = _parsed(["train", "a.toml", "x=1", "--output", "b", "y=2", "z"])
-    assert found.arguments == ["x=1", "y=2", "z"]
-    for wrong in (["simulate", "a.toml", "y=2"], ["train", "a", "--output", "b", "--y", "c"]):
-        with pytest.raises(SystemExit) as caught:
-            _parsed(wrong)
-        assert caught.value.code == 2
-
-
 class TestInterruption:
     """Ctrl-C in an episode keeps those before it."""
 
@@ -261,14 +224,86 @@ class TestInterruption:
         code, out, _ = cli("bench", CART_POLE, "--seconds", "0.01", "--json")
         assert (code, [one["envs"] for one in json.loads(out)["speeds"]]) == (130, [0])
 
-    def test_while_modules_are_loaded(self, monkeypatch):
-        def interrupted(*_, **__):
-            raise KeyboardInterrupt
 
-        monkeypatch.setattr(program, "end_as_after_ctrl_c", lambda: None)
-        monkeypatch.delitem(sys.modules, "fmugym.cli.command_line")
-        monkeypatch.delattr("fmugym.cli.command_line", raising=False)
-        monkeypatch.setattr("builtins.__import__", interrupted)
-        code = program.main()
-        monkeypatch.undo()
-        assert code == 130
+TASK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.02,
+    "episode_length": "1s",
+    "variables": {"tau": {"min": -0.01, "max": 0.01}, "q": {"min": -20, "max": 20}},
+    "agent": {"actions": ["tau"], "observations": ["q"]},
+    "reward": "-abs(q - 1)",
+}
+
+
+class TestSimulate:
+    def test_random_episodes_have_the_seeds_that_were_given(self, cli):
+        task = CART_POLE
+        code, out, err = cli("simulate", task, "--episodes", "2", "--seed", "3", "--json")
+        assert (code, err) == (0, "")
+        episodes = json.loads(out)["episodes"]
+        assert [episode["seed"] for episode in episodes] == [3, 4]
+        assert episodes[0]["total_reward"] == episodes[0]["steps"] > 5
+
+    def test_a_controller(self, cli):
+        controller = "hysteresis of=T setpoint=21 band=0.3"
+        options = "--scenario", "frost", "--steps", "96"
+        code, out, err = cli(
+            "simulate", "fmugym/House-v0", "--controller", controller, *options, "--json"
+        )
+        assert (code, err) == (0, "")
+        (warm,) = json.loads(out)["episodes"]
+        cold = cli("simulate", "fmugym/House-v0", "--action", "0", *options, "--json")[1]
+        assert warm["total_cost"] < 0.2 * json.loads(cold)["episodes"][0]["total_cost"]
+
+    def test_a_controller_begins_each_episode_anew(self, cli):
+        controller = "pid of=T setpoint=21 kp=0.3 ti=7200"
+        options = "--scenario", "frost", "--steps", "20", "--json"
+        arguments = "simulate", "fmugym/House-v0", "--controller", controller, *options
+        both = cli(*arguments, "--seed", "4", "--episodes", "2")[1]
+        second = cli(*arguments, "--seed", "5")[1]
+        assert json.loads(both)["episodes"][1] == json.loads(second)["episodes"][0]
+
+    def test_a_table_of_all_steps(self, tmp_path, ran):
+        fmugym.Task.from_dict(TASK | {"costs": {"effort": "abs(tau)"}}).write(tmp_path / "a.toml")
+        arguments = "--action", "0.01", "--output", tmp_path / "run.csv"
+        out = ran("simulate", tmp_path / "a.toml", *arguments)
+        assert "cost 0.5 in 50 steps (1 s), truncated" in out
+        with (tmp_path / "run.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        assert list(rows[0]) == [
+            *("episode", "step", "time [s]", "tau [N.m]", "q [rad]", "reward", "cost"),
+            *("costs.effort", "terminated", "truncated", "fault"),
+        ]
+        assert len(rows) == 51
+        assert rows[-1]["truncated"] == "1"
+
+
+LOCAL = """
+fmu = { bundled = "Pendulum" }
+time_step = "1h"
+clock = "03-01"
+reward = "-p"
+[data]
+p = { file = "prices.csv", column = "p", interpolation = "previous", timezone = "Europe/Berlin" }
+q = { file = "prices.csv", column = 3, gaps = "3h", timezone = "Europe/Berlin" }
+[agent]
+actions = ["tau"]
+observations = ["p", "q", "q_dot"]
+[variables]
+tau = { min = -1, max = 1 }
+"""
+
+
+def test_a_log_of_local_time_needs_its_zone(refused, tmp_path):
+    pytest.importorskip("minari", reason="needs Minari: the extra minari")
+    task = tmp_path / "task.toml"
+    task.write_text('timezone = "+01:00"' + LOCAL.partition("[data]")[0].replace("-p", "-q**2"))
+    more = LOCAL[LOCAL.index("[agent]") :].replace('"p", "q", "q_dot"', '"q", "q_dot"')
+    task.write_text(task.read_text() + more, encoding="utf-8")
+    rows = [f"2024-10-27 0{hour}:00,0,0,0" for hour in (1, 2, 2, 3)]
+    (tmp_path / "log.csv").write_text("\n".join(["time,q,q_dot,tau", *rows]), encoding="utf-8")
+    command = "simulate", task, "--output", "minari:test/log-v0", "--log", tmp_path / "log.csv"
+    err = refused(*command)
+    assert "row 4 (2024-10-27 02:00)" in err
+    assert "timezone" in err
+    assert "'Europe/Berlin'" in refused(*command, "--timezone", "Europe/Berln")

@@ -1,7 +1,6 @@
 """Residual policies: networks that add to the action of a controller."""
 
 import json
-import re
 from contextlib import closing
 
 import numpy as np
@@ -146,21 +145,6 @@ class TestTraining:
             ran("train", task, "--output", parts, *common)
         ran("train", task, "--output", parts, "--resume")
         assert parameters(parts) == parameters(whole)
-
-    @pytest.mark.parametrize(
-        ("options", "fact"),
-        [
-            (["--residual", "pj", *SAC], "'pj'.*'pi'"),
-            (["--residual", "mpc", *SAC], "plans ahead"),
-            (["--residual", "pi", "--residual-scale", "1.5", *SAC], "at most 1, got 1.5"),
-            (["--residual-scale", "0.5", *SAC], "--residual NAME"),
-            (["--residual", "pi"], "--residual is for trainings with --algorithm"),
-            (["--residual", "pi", "--algorithm", "DQN"], "DQN cannot be made"),
-        ],
-    )
-    def test_what_is_refused(self, task, tmp_path, refused, options, fact):
-        err = refused("train", task, "--output", tmp_path / "agent", "--steps", "64", *options)
-        assert re.search(fact, err)
 
 
 class TestExport:

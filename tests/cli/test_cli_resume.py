@@ -223,12 +223,6 @@ class TestTune:
         assert (folder / "trials" / "002" / "training.json").exists()
         assert json.loads((folder / "training.json").read_text())["arguments"] == facts["arguments"]
 
-    def test_without_optuna_the_extra_is_named(self, task, tmp_path, refused, monkeypatch):
-        monkeypatch.setitem(sys.modules, "optuna", None)
-        arguments = "--output", tmp_path / "agent", "--algorithm", "PPO", "--tune", "2"
-        assert ".[tune]" in refused("train", task, *arguments)
-        assert not (tmp_path / "agent").exists()
-
 
 class TestTrack:
     def options(self, tmp_path):
@@ -255,12 +249,6 @@ class TestTrack:
         monkeypatch.setenv("WANDB_SILENT", "true")
         ran("train", task, *self.options(tmp_path), "--track", "wandb")
         assert list((tmp_path / "agent").rglob("offline-run-*/*.wandb"))
-
-    @pytest.mark.parametrize("name", ["mlflow", "wandb"])
-    def test_a_missing_library_names_its_extra(self, name, task, tmp_path, refused, monkeypatch):
-        monkeypatch.setitem(sys.modules, name, None)
-        assert f".[{name}]" in refused("train", task, *self.options(tmp_path), "--track", name)
-        assert not (tmp_path / "agent").exists()
 
 
 class TestDamagedAgents:
@@ -358,20 +346,3 @@ class TestRecord:
         assert again == recorded(whole / "records" / "training.csv")[-len(again) :]
         for path in (whole / "records").glob("evaluation-*"):
             assert (parts / "records" / path.name).read_text() == path.read_text()
-
-    @pytest.mark.parametrize(
-        ("options", "fact"),
-        [
-            (["--record", "qq"], "'qq'"),
-            (["--record", "q", "--record-env", "3"], "0 to 2"),
-            (["--record", "q", "--record-every", "0.01"], "0.05"),
-            (["--record", "q", "--record-format", "cvs"], "'csv'"),
-            (["--record-env", "1"], "--record "),
-        ],
-    )
-    def test_mistakes_are_told_before_the_training(self, options, fact, task, tmp_path, cli):
-        folder = tmp_path / "agent"
-        code, out, err = cli("train", task, "--output", folder, *self.COMMON, *options)
-        assert (code, out) == (1, "")
-        assert fact in err
-        assert not folder.exists()

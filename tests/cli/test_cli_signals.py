@@ -188,13 +188,12 @@ def test_an_error_in_a_clean_up_does_not_hide_the_signal(number, tmp_path, cli, 
     assert "Directory not empty" in err
 
 
-def test_while_modules_are_loaded(monkeypatch):
-    def signalled():
-        os.kill(os.getpid(), signal.SIGTERM)
+@pytest.mark.parametrize(
+    ("error", "code"), [(KeyboardInterrupt(), 130), (SignalledEnd(signal.SIGTERM), 143)]
+)
+def test_while_modules_are_loaded(error, code, monkeypatch):
+    def interrupted():
+        raise error
 
-    monkeypatch.setattr(program, "end_as_after_ctrl_c", signalled)
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        assert program.main() == 143
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    monkeypatch.setattr(program, "end_as_after_ctrl_c", interrupted)
+    assert program.main() == code

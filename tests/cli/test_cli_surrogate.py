@@ -23,22 +23,6 @@ def test_an_fmu_and_a_picture_are_written(tmp_path, ran):
     assert len(result)
 
 
-@pytest.mark.parametrize(
-    ("options", "reason"),
-    [
-        ([TASK, "--surrogate", "--output", "twin.c"], "ends in .fmu"),
-        (["--surrogate", "--output", "twin.fmu"], "needs a task"),
-        ([TASK, "--surrogate", "--steps", "0", "--output", "twin.fmu"], "--steps"),
-        ([TASK, "--surrogate", "--output", "twin.fmu", "--plot", "twin.doc"], "twin.doc"),
-        ([TASK, "--output", "twin.fmu", "--plot", "twin.png"], "give --surrogate"),
-    ],
-)
-def test_what_cannot_be_done_is_refused(options, reason, tmp_path, monkeypatch, refused):
-    monkeypatch.chdir(tmp_path)
-    assert reason in refused("export", *options)
-    assert [*tmp_path.iterdir()] == []
-
-
 def test_plans_may_be_made_on_a_surrogate(ran):
     """By the text of a controller."""
     planner = "mpc horizon=0.5s candidates=16 rounds=2 model=surrogate steps=200"

@@ -4,7 +4,6 @@ import csv
 import errno
 import json
 import pickle
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -132,27 +131,6 @@ def test_arguments_of_an_algorithm():
         algorithm_arguments(["gamma"])
 
 
-def test_without_sb3_training_names_the_extra(tmp_path, trained, monkeypatch):
-    monkeypatch.setitem(sys.modules, "fmugym.training.sb3", None)
-    code, out, err = trained(CART_POLE, "--output", tmp_path / "agent")
-    assert (code, out) == (1, "")
-    assert "pip install '.[sb3]'" in err
-    assert not (tmp_path / "agent").exists()
-
-
-@pytest.mark.parametrize("command", ["simulate", "evaluate", "tune", "train"])
-def test_an_fmu_has_no_reward_to_play_for(command, tmp_path, cli):
-    fmu = fmugym.bundled_fmu("Pendulum")
-    more = {
-        "tune": ["pid of=q setpoint=0 kp=0..1"],
-        "train": ["--output", tmp_path / "agent"],
-    }
-    code, out, err = cli(command, fmu, *more.get(command, []))
-    assert (code, out) == (1, "")
-    assert "fmugym new Pendulum.fmu" in err
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("reward", "terminated", "told"),
     [
@@ -209,13 +187,6 @@ class TestTrain:
         assert "n_steps" not in err
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
         assert [int(row["steps"]) for row in rows] == [28, 132, 256]
-
-    def test_a_rollout_that_is_longer_than_the_training_is_an_error(self, tmp_path, trained):
-        options = "--steps", "100", "--envs", "2", "--output", tmp_path / "a"
-        code, _, err = trained(CART_POLE, "n_steps=64", *options)
-        assert code == 1
-        assert "128 steps (n_steps=64 in 2 environments)" in err
-        assert not (tmp_path / "a").exists()
 
     @pytest.mark.parametrize(
         ("arguments", "steps", "done"),
@@ -351,20 +322,3 @@ class TestTrain:
         code, *_ = cli("evaluate", tmp_path / "a.toml", "--agent", folder, "--episodes", "1")
         assert code == 0
         assert ("reward" in json.loads((folder / "agent.json").read_text())) == bool(evaluations)
-
-    @pytest.mark.parametrize(
-        ("arguments", "fact"),
-        [
-            (["--algorithm", "PPOO"], "'PPO'"),
-            (["n_step=3"], "'n_steps'"),
-            (["learningrate=1e-3"], "'learning_rate'"),
-            (["n_steps"], "'n_steps'"),
-            (["--steps", "0"], "--steps"),
-        ],
-    )
-    def test_mistakes(self, arguments, fact, tmp_path, trained):
-        options = "--output", tmp_path / "agent"
-        code, _, err = trained(CART_POLE, *arguments, *options)
-        assert code == 1
-        assert fact in err
-        assert not (tmp_path / "agent").exists()

@@ -60,31 +60,6 @@ class TestTune:
         _, _, err = cli("tune", HOUSE, pid, *FEW, "--rounds", "6")
         assert "setpoint" in err.splitlines()[-1]
 
-    @pytest.mark.parametrize(
-        ("arguments", "fact"),
-        [
-            ([RANGES.replace("0.05..5", "5..0.05")], "5..0.05"),
-            (["pid of=T setpoint=20..21"], "'kp'"),
-            (["schedule 06:00=0..1"], "hysteresis, pid"),
-            ([RANGES, "--candidates", "7"], "8"),
-            ([RANGES, "--rounds", "0"], "--rounds"),
-            ([RANGES, "--output", "a.json"], ".toml"),
-            ([RANGES, "--output", "a.toml", "--name", "a b"], "'a b'"),
-            ([RANGES, "--output", "missing/a.toml"], "'missing'"),
-            ([RANGES, "--scenario", "frst"], "'frost'"),
-        ],
-    )
-    def test_mistakes(self, arguments, fact, cli):
-        code, out, err = cli("tune", HOUSE, *arguments)
-        assert (code, out) == (1, "")
-        assert fact in err
-
-    def test_a_file_that_exists_is_kept(self, tmp_path, refused):
-        path = tmp_path / "a.toml"
-        path.write_text("mine")
-        refused("tune", HOUSE, RANGES, "--output", path)
-        assert path.read_text() == "mine"
-
     @pytest.mark.skipif(sys.platform == "win32", reason="needs the signal of Ctrl-C")
     def test_ctrl_c_keeps_the_best_until_then(self, tmp_path):
         path = tmp_path / "tuned.toml"

@@ -5,16 +5,16 @@ import zipfile
 
 import pytest
 import ssp_tools
-import test_cli
+import test_cli_inspection
 from fmu_tools import probe_fmu
 from makers import MADE
-from test_cli import INPUT, OUTPUT, variable
+from test_cli_inspection import INPUT, OUTPUT, variable
 
 import fmugym
 from fmugym.cli.task_proposal import Proposal
 from fmugym.fmi.bundled import MODELS
 
-make_fmu = test_cli.make_fmu
+make_fmu = test_cli_inspection.make_fmu
 
 
 def proposed(ran, fmu):

@@ -188,6 +188,7 @@ class TestSingle:
         [
             ({"variables": "angel"}, "'angle'"),
             ({"every": 0.07}, "0.05"),
+            ({"every": -0.05}, "-0.05"),
             ({"most_rows": 0}, "most_rows"),
             ({"path": "run.xls"}, "run.xls"),
         ],

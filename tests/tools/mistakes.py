@@ -1,15 +1,14 @@
 """A few hundred mistakes of users: each message says what, expected, actual and the nearest name.
 
 ``python tests/tools/mistakes.py`` prints all messages, for a person to read. Most mistakes are
-made of the tables of the package, so that new keys, options and arguments are covered as they
-come.
+made of the tables of the package, so that new keys and arguments are covered as they come.
+``command_mistakes.py`` has those on the command line.
 """
 
 import contextlib
 import copy
 import functools
 import inspect
-import io
 import os
 import re
 import sys
@@ -23,7 +22,6 @@ import tomlkit
 from gymnasium import spaces
 
 import fmugym
-from fmugym.cli.command_line import _parser, run_command_line
 from fmugym.environment.config import EnvConfig
 from fmugym.errors import shown
 from fmugym.task import task_keys as task_format
@@ -70,114 +68,6 @@ WANTED = re.compile(r"must be|expected|known are|reads version")
 def misspelt(name: str) -> str:
     """A slip of the finger, whose nearest name is the name itself."""
     return name + name[-1]
-
-
-# The command line
-
-
-def on_the_command_line(*arguments: str) -> str:
-    """Run a command that must fail; returns its only line."""
-    printed, error = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(error):
-        try:
-            code = run_command_line(arguments)
-        except SystemExit as end:
-            code = end.code
-    assert code in {1, 2}, (arguments, code, printed.getvalue())
-    assert not printed.getvalue(), arguments
-    line = error.getvalue()
-    assert line.startswith("fmugym"), line
-    return line.removesuffix("\n")
-
-
-def command(*arguments: str, facts: tuple[str, ...]) -> Mistake:
-    return Mistake(f"fmugym {' '.join(arguments)}", lambda: on_the_command_line(*arguments), facts)
-
-
-POSITIONAL = {
-    **dict.fromkeys(("info", "new"), ("model.fmu",)),
-    **dict.fromkeys(("validate", "simulate", "evaluate", "serve", "bench"), ("task.toml",)),
-    "train": ("task.toml", "--output", "agent"),
-    "tune": ("task.toml", "pid of=q setpoint=1 kp=0.1..1"),
-    "fit": ("task.toml", "--log", "log.csv"),
-    "export": ("agent", "--task", "task.toml", "--output", "agent.c"),
-}
-"""Arguments with which each command would begin."""
-
-
-def _first_required(parser):
-    """The name in the usage of the first argument that a command needs."""
-    needed = next((one for one in parser._actions if one.required), None)
-    return "" if needed is None else (needed.option_strings or [needed.metavar])[0]
-
-
-def of_options() -> Iterator[Mistake]:
-    """Every command and option misspelt, and every number given as a word."""
-    for name, parser in _parser()[1].items():
-        yield command(misspelt(name), facts=(misspelt(name), f"did you mean {name!r}"))
-        given = (name, *POSITIONAL[name])
-        for action in parser._actions:
-            for option in (one for one in action.option_strings if one.startswith("--")):
-                wrong = misspelt(option)
-                yield command(*given, wrong, facts=(wrong, f"did you mean {option!r}"))
-                if action.type in {int, float}:
-                    kind = "an integer" if action.type is int else "a number"
-                    yield command(*given, option, "abc", facts=(option, "'abc'", kind))
-        if POSITIONAL[name]:
-            yield command(name, facts=("required", _first_required(parser)))
-        yield command(name, *POSITIONAL[name], "--json=1", facts=("--json", "'1'"))
-
-
-COMMANDS = {
-    (): ("COMMAND", "required"),
-    ("--verson",): ("--verson", "'--version'"),
-    ("info", "modle.fmu"): ("modle.fmu", "'model.fmu'"),
-    ("info", "taks.toml"): ("taks.toml", "'task.toml'"),
-    ("info", "task.tml"): ("task.tml", "'task.toml'"),
-    ("info", "prices.csv"): ("prices.csv", "FMU", "zip"),
-    ("info", "model.fmu", "extra"): ("'extra'",),
-    ("new", "task.toml"): ("task.toml", "FMU"),
-    ("new", "model.fmu", "--output", "no/t.toml"): ("no/t.toml", "'no'"),
-    ("validate", "task"): ("'task'", "'task.toml'"),
-    ("validate", "nothing"): ("'nothing'",),
-    ("validate", "task.toml:Task"): ("'task.toml'", "module"),
-    ("validate", "drive:"): ("'drive:'",),
-    ("validate", "drvie:Drive"): ("'drvie'", "'drive'"),
-    ("validate", "drive:Drvie"): ("'Drvie'", "'Drive'"),
-    ("validate", "broken:Drive"): ("'broken'", "NameError", "oops"),
-    ("validate", "math:pi"): ("3.14", "module:Class"),
-    ("validate", "fmugym/CartPol-v0"): ("fmugym/CartPol-v0", "'fmugym/CartPole-v0'"),
-    ("simulate", "task.toml", "--steps", "-1"): ("--steps", "-1"),
-    ("simulate", "task.toml", "--episodes", "0"): ("--episodes", "0"),
-    ("simulate", "task.toml", "--seed", "-1"): ("seed", "-1"),
-    ("simulate", "task.toml", "--action", "0.5"): ("'0.5'", "0.01"),
-    ("simulate", "task.toml", "--action", "0,0"): ("'0,0'", "(1,)"),
-    ("simulate", "task.toml", "--action", "left"): ("'left'", "random"),
-    ("simulate", "task.toml", "--action", "nan"): ("'nan'",),
-    ("simulate", "task.toml", "--action", "1"): ("'1'", "0.01"),
-    ("simulate", "task.toml", "--controller", "pid"): ("'of'", "PID"),
-    ("simulate", "task.toml", "--controller", "pit of=q"): ("'pit'",),
-    ("simulate", "task.toml", "--controller", "pid of=qq setpoint=1 kp=1"): ("'qq'", "'q'"),
-    ("simulate", "task.toml", "--controller", "pid of=q setpont=1"): ("'setpont'", "'setpoint'"),
-    ("simulate", "task.toml", "--agent", "nowhere"): ("'nowhere'", "fmugym train"),
-    ("simulate", "task.toml", "--scenario", "forst"): ("'forst'",),
-    ("simulate", "task.toml", "--output", "no/run.csv"): ("no/run.csv", "'no'"),
-    ("simulate", "task.toml", "--output", "run.xls"): ("run.xls", ".csv"),
-    ("evaluate", "task.toml", "--plot", "a.pgn"): ("'a.pgn'", ".png"),
-    ("simulate", "task.toml", "--output", "a.csv", "--variables", "qq"): ("'qq'", "'q'"),
-    ("simulate", "task.toml", "--output", "a.csv", "--every", "0.03"): ("0.03", "0.02"),
-    ("bench", "task.toml", "--envs", "0"): ("num_envs", "0"),
-    ("bench", "task.toml", "--seconds", "-1"): ("--seconds", "-1"),
-    ("tune", "task.toml", "pid of=q setpoint=1 kp=1"): ("range", "kp=0.05..5"),
-    ("tune", "task.toml", "pid of=q kp=1..a"): ("'1..a'", "range"),
-    ("fit", "task.toml", "--log", "log.csv", "--plot", "a.pgn"): ("'a.pgn'", ".png"),
-    ("fit", "task.toml", "--log", "log.csv", "--output", "a.tml"): ("'a.tml'", ".toml"),
-    ("fit", "task.toml", "--log", "no.csv", "--parameter", "l"): ("'no.csv'", "cannot be read"),
-    ("export", "nowhere", "--task", "task.toml", "--output", "a.cc"): ("'a.cc'", ".onnx"),
-    ("export", "x", "--task", "task.toml", "--output", "a.c", "--fmi", "4.0"): ("--fmi", "'4.0'"),
-    ("info", "--repair", "task.toml"): ("task.toml", "FMU"),
-    ("info", "--repair", "model.fmu"): ("model.fmu", "source code"),
-}
 
 
 # Task files
@@ -574,8 +464,6 @@ def of_calls() -> Iterator[Mistake]:
 
 
 GROUPS: dict[str, Callable[[], list[Mistake]]] = {
-    "options": lambda: list(of_options()),
-    "commands": lambda: [command(*given, facts=facts) for given, facts in COMMANDS.items()],
     "keys": lambda: list(of_keys()),
     "names": lambda: list(of_names()),
     "expressions": lambda: list(of_expressions()),

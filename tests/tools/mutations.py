@@ -1,6 +1,6 @@
 """Mutations of the package that its contract suites must find: ``python tests/tools/mutations.py``.
 
-    python tests/tools/mutations.py [--only pool environment expressions] [--list]
+    python tests/tools/mutations.py [--only ROOM ...] [--list]
 
 Tests are contracts. Each mutation is a plausible fault in a room of the package that no type
 checker and no import finds, with a sentence on what a user would notice. The program makes one at a
@@ -42,6 +42,7 @@ SUITES: Final[Mapping[str, Suite]] = {
         "not exported and not training",
     ),
     "expressions": ("tests/expressions",),
+    "command line": ("tests/cli/test_commands.py",),
 }
 """Contract suites by room, as arguments of pytest; without Wine, and without the golden cases that
 are not of environments but of agents."""
@@ -325,6 +326,77 @@ MUTATIONS: Final = (
         "inside = where(x < table[0], table[-2]",
         "inside = where(x < table[0], table[-1]",
         "in ONNX, before its first point a curve has the value after the last one",
+    ),
+    # The command line
+    Mutation(
+        "command line",
+        "cli/signals.py",
+        'return 128 + getattr(error, "number", signal.SIGINT)',
+        'return int(getattr(error, "number", signal.SIGINT))',
+        "after Ctrl-C the exit code is that of wrong arguments",
+    ),
+    Mutation(
+        "command line",
+        "cli/options.py",
+        "if _is_replaceable(path) and not is_forced:",
+        "if path.is_dir() and not is_forced:",
+        "files that exist are replaced without --force",
+    ),
+    Mutation(
+        "command line",
+        "cli/options.py",
+        "                _remove(path)\n                aside.rename(path)\n",
+        "                _remove(aside)\n",
+        "a command that fails with --force has removed the old file",
+    ),
+    Mutation(
+        "command line",
+        "cli/command_line.py",
+        "        drop_output()\n    except (FMUGymError, OSError) as error:",
+        "        return 1\n    except (FMUGymError, OSError) as error:",
+        "'fmugym info model.fmu | head' fails",
+    ),
+    Mutation(
+        "command line",
+        "cli/options.py",
+        "if is_needed or not quiet.get():",
+        "if not quiet.get():",
+        "with -q, a command that fails does not say why",
+    ),
+    Mutation(
+        "command line",
+        "cli/options.py",
+        'say(json.dumps({"schema": _JSON_VERSION, **facts}, indent=2, default=str))',
+        "say(json.dumps(facts, indent=2, default=str))",
+        "the JSON of a command has no version",
+    ),
+    Mutation(
+        "command line",
+        "cli/task_arguments.py",
+        "if path.is_file() and not takes_fmu:",
+        "if path.is_file() and takes_fmu:",
+        "commands play for a reward that nobody has looked at",
+    ),
+    Mutation(
+        "command line",
+        "cli/command_line.py",
+        'self.error(str(unknown_name("option", text.partition("=")[0], self.options)))',
+        'self.error(f"unknown option {text!r}")',
+        "an option that is misspelt does not get its nearest name",
+    ),
+    Mutation(
+        "command line",
+        "cli/options.py",
+        "return kinds[kind] <= _OF_ONE_KIND",
+        "return kinds[kind] < _OF_ONE_KIND",
+        "two warnings of a kind are told instead of three",
+    ),
+    Mutation(
+        "command line",
+        "cli/training_commands.py",
+        '        _refuse(arguments, _OF_SEARCHES, "is for searches, without --algorithm")\n',
+        "        pass\n",
+        "a training with an algorithm ignores --minutes and --rounds",
     ),
 )
 

@@ -1,4 +1,4 @@
-"""Controllers of task files: each is checked by ``validate``, and may measure expressions."""
+"""Command ``validate``: defects of tasks, and controllers that cannot act."""
 
 from contextlib import closing
 
@@ -10,6 +10,134 @@ from fmugym.cli import validation
 from fmugym.cli.validation import validate
 from fmugym.control import controller_of
 from fmugym.records.players import policy_of, simulate
+
+TASK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.02,
+    "episode_length": "1s",
+    "variables": {"tau": {"min": -0.01, "max": 0.01}, "q": {"min": -20, "max": 20}},
+    "agent": {"actions": ["tau"], "observations": ["q"]},
+    "reward": "-abs(q - 1)",
+}
+
+
+DEFECTS = {
+    "useless action": (
+        {
+            "variables": {"idle": {"min": 0, "max": 1}} | TASK["variables"],
+            "agent": {"actions": ["tau", "idle"], "observations": ["q"]},
+        },
+        ("warning", "actions", "element 1"),
+    ),
+    "an action that only the reward knows": (
+        {
+            "variables": {"fee": {"min": 0, "max": 1}} | TASK["variables"],
+            "agent": {"actions": ["tau", "fee"], "observations": ["q"]},
+            "reward": "-abs(q - 1) - fee",
+        },
+        ("warning", "actions", "no effect on observations: element 1"),
+    ),
+    "a reward that no action changes": (
+        {"reward": "-abs(time - 1)"},
+        ("warning", "reward", "the same in 50 steps, whatever the actions"),
+    ),
+    "a tiny reward": (
+        {"reward": "-1e-7 * abs(q - 1)"},
+        ("warning", "reward", "from -3"),
+    ),
+    "a reward that hardly differs": (
+        {"reward": "-1 - 1e-11 * abs(q - 1)"},
+        ("warning", "reward", "from -1 to -1 with random actions, a difference of"),
+    ),
+    "an end that pays": (
+        {"terminated": "step == 20"},
+        ("warning", "reward", "until the task ends: never positive"),
+    ),
+    "constant reward": ({"reward": 1}, ("warning", "reward", "always 1")),
+    "no limit": ({"episode_length": None}, ("warning", "length", "no limit")),
+    "outside": (
+        {"variables": {"tau": {}, "q": {"min": 0, "max": 1e-3}}},
+        ("warning", "observations", "q "),
+    ),
+    "sizes": (
+        {
+            "agent": {"actions": "tau", "observations": ["q", "big"]},
+            "expressions": {"big": "1e5 * q"},
+        },
+        ("warning", "observations", "big reaches"),
+    ),
+    "useless parameter": (
+        {"parameters": {"v_c": {"distribution": "uniform", "low": 0.1, "high": 0.2}, "c": 0}},
+        ("warning", "parameters", "v_c"),
+    ),
+    "useless constant": (
+        {"parameters": {"v_c": 0.1, "c": 0}},
+        ("warning", "parameters", "v_c"),
+    ),
+    "idle inputs": (
+        {
+            "fmu": {"bundled": "DoublePendulum"},
+            "variables": {"tau1": {"min": -0.01, "max": 0.01}},
+            "agent": {"actions": ["tau1"], "observations": ["q1"]},
+            "reward": "-abs(q1 - 1)",
+        },
+        ("warning", "inputs", "tau2"),
+    ),
+    "fault": ({"reward": "1 / (step - 3)"}, ("error", "run", "step 3")),
+    "unknown to a controller": (
+        {"agent": {"actions": ["tau"], "observations": ["q", "l"]}},
+        ("warning", "export", "'l', which is no output"),
+    ),
+}
+
+
+class TestValidate:
+    @pytest.mark.parametrize(("change", "expected"), DEFECTS.values(), ids=DEFECTS)
+    def test_defects_are_found_and_cured(self, change, expected):
+        task = {key: value for key, value in (TASK | change).items() if value is not None}
+        report = validate(lambda: fmugym.load(task))
+        verdict, check, text = expected
+        (finding,) = [one for one in report.findings if one.verdict != "ok"]
+        assert (finding.verdict, finding.check) == (verdict, check)
+        assert text in finding.text
+        assert finding.cure
+        assert report.verdict == verdict
+        assert report.recommended.get("normalize", False) == ("big reaches" in text)
+
+    @pytest.mark.parametrize("normalize", [False, True])
+    def test_figures_are_in_the_units_of_the_task(self, normalize):
+        variables = {"tau": {"min": -0.01, "max": 0.01}, "q": {"unit": "deg", "min": 1, "max": 5}}
+        task = TASK | {"variables": variables, "agent": TASK["agent"] | {"normalize": normalize}}
+        (finding,) = [one for one in validate(lambda: fmugym.load(task)).findings if one.cure]
+        assert "limits: q (-" in finding.text
+        assert "to 180.1 deg)" in finding.text
+
+    def test_a_sound_task(self):
+        report = validate(lambda: fmugym.load(TASK))
+        assert report.verdict == "ok"
+        assert report.hooks == "expressions"
+        (export,) = [one.text for one in report.findings if one.check == "export"]
+        assert "can be exported; it measures q" in export
+        assert 0 < report.costs["step"] < 1
+        assert 0 < report.costs["reset"] < 1
+        assert 0 < report.costs["restore"] < 1
+        assert report.recommended["envs"] in (8, 16, 64)
+        assert report.recommended["reset_method"] == report.reset_method
+
+    def test_an_error_gives_the_exit_code(self, tmp_path, cli):
+        fmugym.Task.from_dict(TASK | {"reward": "1 / (step - 3)"}).write(tmp_path / "a.toml")
+        code, out, _ = cli("validate", tmp_path / "a.toml")
+        assert code == 1
+        assert "error    run: step 3" in out
+
+    def test_an_fmu_an_id_and_a_class(self, ran):
+        targets = fmugym.bundled_fmu("CartPole"), "fmugym/CartPole-v0", "fmugym.envs:CartPoleEnv"
+        for target in targets:
+            out = ran("validate", target)
+            assert "hooks in a vector environment: " in out
+            assert "vector environment: one by one" not in out
+            assert ("length: an episode takes at most 500 steps" in out) is (target == targets[1])
+
 
 TEXT = """
 fmu = {{ bundled = "Pendulum" }}

@@ -1,10 +1,7 @@
-"""The command line: what it says of FMUs, and that the skeletons it writes run."""
+"""Commands ``info`` and ``new``: what they say of FMUs and data, and that what they write runs."""
 
 import json
-import logging
 import re
-import shlex
-import subprocess
 import sys
 import tomllib
 import zipfile
@@ -15,14 +12,13 @@ import makers
 import pytest
 import quirk_table
 import zoo_tools
-from fmu_tools import HERE, library_name, probe_fmu, read_fmu
+from fmu_tools import edited_fmu, library_name, probe_fmu, read_fmu
 from plants import ONCE
 from process_tools import run_python
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
-from fmugym.cli.command_line import _parser, run_command_line
-from fmugym.cli.options import EXAMPLES, speaking
+from fmugym.cli.command_line import run_command_line
 from fmugym.fmi.bundled import FMI_VERSIONS
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
@@ -34,10 +30,6 @@ XML = """<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
-def run(*arguments, **options):
-    return run_python("-m", "fmugym", *arguments, **options)
-
-
 def variable(name, inner, causality="input", variability="continuous", **attributes):
     attributes |= {"name": name, "valueReference": zlib.crc32(name.encode())}
     attributes |= {"causality": causality, "variability": variability}
@@ -45,7 +37,6 @@ def variable(name, inner, causality="input", variability="continuous", **attribu
     return f"<ScalarVariable {listing}>{inner}</ScalarVariable>"
 
 
-PROGRAM = "import sys; from fmugym.__main__ import main; sys.exit(main())"
 INPUT = variable("u", '<Real start="0"/>')
 OUTPUT = variable("y", "<Real/>", "output", initial="calculated")
 
@@ -452,139 +443,6 @@ def config_of(text):
 
 
 class TestCommand:
-    def test_an_error_is_one_line(self, tmp_path):
-        done = run("info", tmp_path / "none.fmu")
-        assert done.returncode == 1
-        assert done.stdout == ""
-        assert done.stderr.startswith("fmugym: error: there is no FMU at")
-        assert done.stderr.count("\n") == 1
-
-    def test_an_id_that_does_not_exist_has_one_nearest_name(self, refused):
-        said = refused("bench", "fmugym/CartPol-v0")
-        assert said.count("Did you mean") == 1
-        assert "'fmugym/CartPole-v0'" in said
-
-    @pytest.mark.parametrize("arguments", [[], ["info"], ["inof", "x.fmu"], ["info", "x", "-y"]])
-    def test_wrong_arguments_exit_with_2(self, arguments, capsys):
-        with pytest.raises(SystemExit) as caught:
-            run_command_line(arguments)
-        assert caught.value.code == 2
-        assert "error" in capsys.readouterr().err
-
-    @pytest.mark.parametrize("name", EXAMPLES)
-    def test_help_has_examples_that_the_documents_run(self, name, capsys):
-        with pytest.raises(SystemExit):
-            run_command_line([name, "--help"])
-        said = capsys.readouterr().out
-        pages = " ".join(page.read_text() for page in (HERE.parent / "docs").glob("*.md"))
-        documents = " ".join(pages.replace("\\\n", " ").split())
-        for example in EXAMPLES[name]:
-            assert f"\n  {example}\n" in said
-            assert example in documents
-
-    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(
-        self, tmp_path, ran, refused
-    ):
-        fmu, file = str(fmugym.bundled_fmu("Pendulum")), tmp_path / "a.toml"
-        file.write_text("precious")
-        err = refused("new", fmu, "--output", file)
-        assert "a.toml exists; name a new one, or replace it with --force" in err
-        refused("new", fmu + "x", "--output", file, "--force")
-        assert file.read_text() == "precious"
-        ran("new", fmu, "--output", file, "--force")
-        assert "time_step" in file.read_text()
-        assert sorted(tmp_path.iterdir()) == [file, tmp_path / "fmugym.schema.json"]
-
-    @pytest.mark.parametrize(
-        "arguments",
-        [
-            "new wrong.fmu --output out.toml",
-            "new --class wrong.fmu --output out.py",
-            "simulate wrong.toml --output out.csv --output out.html",
-            "evaluate wrong.toml --plot out.png",
-            "tune wrong.toml 'pid of=q setpoint=1 kp=0..1' --output out.toml",
-            "train wrong.toml --output out",
-            "export wrong.toml --task wrong.toml --output out.c",
-        ],
-    )
-    def test_what_is_refused_leaves_no_file_behind(self, arguments, tmp_path, monkeypatch, cli):
-        monkeypatch.chdir(tmp_path)
-        wrong = {tmp_path / name for name in ("wrong.fmu", "wrong.toml")}
-        for path in wrong:
-            path.write_text('fmu = { bundled = "Pendulum" }\nreward = "-abs(p)"\n')
-        code, out, err = cli(*shlex.split(arguments))
-        assert (code, out) == (1, "")
-        assert err.startswith("fmugym: error: ")
-        assert set(tmp_path.iterdir()) == wrong
-
-    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, refused):
-        file = tmp_path / "run.csv"
-        file.write_text("precious")
-        assert "run.csv exists" in refused("simulate", "absent.toml", "--output", file)
-
-    def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, cli):
-        fmu = make_fmu(INPUT, OUTPUT)
-        for options, notes in (([], True), (["-q"], False)):
-            code, out, err = cli("new", fmu, *options)
-            assert code == 0
-            assert "time_step" in out
-            assert bool(err) is notes
-
-    @pytest.mark.parametrize(("option", "told"), [("-v", "0 1 2"), ("-q", "2")])
-    def test_the_log_of_this_command_only(self, option, told, capsys):
-        logger = logging.getLogger("fmugym")
-        before = logger.handlers[:], logger.level
-        for name, parser in _parser()[1].items():
-            given = ["a", "b", "--output", "c", "--task", "d", "--log", "e", option]
-            arguments, _ = parser.parse_known_args(given)
-            with speaking(arguments):
-                for text, level in enumerate((logging.INFO, logging.WARNING, logging.ERROR)):
-                    logger.log(level, text)
-            assert capsys.readouterr().err.split() == told.split(), name
-        assert (logger.handlers, logger.level) == before
-
-    @pytest.mark.parametrize(("option", "told"), [(None, 5), ("-v", 12), ("-q", 0)])
-    def test_warnings_of_one_kind_are_told_some_times(self, option, told, capsys):
-        """Those of other places stay, and a line tells how many are left out."""
-        logger = logging.getLogger("fmugym.Some")
-        arguments, _ = _parser()[0].parse_known_args(["bench", "a", *filter(None, [option])])
-        with speaking(arguments):
-            for number in range(10):
-                logger.warning("environment %d fails", number)
-            for number in range(2):
-                logger.warning("another %d", number)
-        err = capsys.readouterr().err.splitlines()
-        assert sum("environment" in line or "another" in line for line in err) == told
-        assert [line for line in err if "7 more" in line and "-v" in line] == err[told:]
-        assert len(err) == told + (option is None)
-
-    @pytest.mark.parametrize("program", [["-m", "fmugym"], ["-c", PROGRAM]])
-    def test_classes_in_the_working_directory_are_found(self, tmp_path, program):
-        """The program ``fmugym`` has its own folder in front, not the working directory."""
-        text = "from fmugym.envs import CartPoleEnv\n\n\nclass Drive(CartPoleEnv):\n    pass\n"
-        (tmp_path / "drive.py").write_text(text)
-        command = "-P" if "-c" in program else "-B", *program, "simulate", "drive:Drive"
-        done = run_python(*command, "--steps", 3, cwd=tmp_path)
-        assert "reward 3 in 3 steps" in done.stdout, done.stderr
-
-    def test_version(self, capsys):
-        with pytest.raises(SystemExit) as caught:
-            run_command_line(["--version"])
-        assert caught.value.code == 0
-        assert capsys.readouterr().out.strip()[0].isdigit()
-
-    @pytest.mark.skipif(sys.platform == "win32", reason="head and its pipe")
-    def test_a_reader_that_stops_early_is_no_error(self, make_fmu):
-        many = (variable(f"p{n}", "<Real/>", "local") for n in range(4_000))
-        command = [sys.executable, "-m", "fmugym", "info", str(make_fmu(*many)), "--all"]
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            process.stdout.readline()
-            process.stdout.close()
-            assert process.stderr.read() == ""
-        assert process.returncode == 0
-
     def test_output_fits_the_narrowest_console(self, make_fmu):
         path = make_fmu(INPUT, OUTPUT, description="25 \u00b0C")
         commands = [
@@ -608,3 +466,107 @@ class TestCommand:
             made = tmp_path / f"made{len(kind)}"
             ran("new", path, *kind, "--output", made)
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")
+
+
+class TestTasks:
+    @pytest.mark.parametrize(("model", "version"), ONCE)
+    def test_what_it_writes_passes_validate(self, model, version, tmp_path, cli):
+        path = tmp_path / "task.toml"
+        fmu = fmugym.bundled_fmu(model, version)
+        code, out, err = cli("new", fmu, "--output", path)
+        assert (code, out) == (0, "")
+        assert "reward and set point are guesses" in err
+        code, out, err = cli("validate", path, "--json")
+        findings = json.loads(out)["findings"]
+        assert (code, err) == (0, "")
+        bad = {finding["check"] for finding in findings if finding["verdict"] != "ok"}
+        # sizes of temperatures and powers differ, nothing writes the weather, and the FMU's default
+        # experiment is shorter than the time constant of its walls
+        of_house = {"inputs", "observations", "length"}
+        assert bad <= (of_house if model == "House" else {"observations"})
+
+    def test_names_that_are_no_names_of_python(self, tmp_path, ran, load):
+        odd = {'name="tau"': 'name="a.b[1] &quot;x&quot;\\ \u00e4"', 'name="q"': 'name="step"'}
+        fmu = edited_fmu(fmugym.bundled_fmu("Pendulum"), tmp_path, odd)
+        out = ran("new", fmu)
+        assert out.isascii()
+        env = load(tomllib.loads(out))
+        assert env.config.model_input_names == ('a.b[1] "x"\\ \u00e4',)
+        assert "step" in env.config.model_output_names
+
+    def test_the_path_of_an_fmu_below_the_file_is_relative(self, tmp_path, cli):
+        (tmp_path / "fmus").mkdir()
+        fmu = tmp_path / "fmus" / "Pendulum.fmu"
+        fmu.write_bytes(fmugym.bundled_fmu("Pendulum").read_bytes())
+        cli("new", fmu, "--output", tmp_path / "task.toml")
+        assert 'fmu = "fmus/Pendulum.fmu"' in (tmp_path / "task.toml").read_text()
+        fmugym.load(tmp_path / "task.toml").close()
+
+
+DATA = """
+fmu = { bundled = "Pendulum" }
+time_step = "1h"
+clock = "03-01"
+reward = "-p"
+[data]
+p = { file = "prices.csv", column = "p", interpolation = "previous", timezone = "Europe/Berlin" }
+q = { file = "prices.csv", column = 3, gaps = "3h", timezone = "Europe/Berlin" }
+[agent]
+actions = ["tau"]
+observations = ["p", "q", "q_dot"]
+[variables]
+tau = { min = -1, max = 1 }
+"""
+
+
+@pytest.fixture
+def task(tmp_path):
+    hours = [*range(3), *range(3, 24)]
+    rows = [f"2024-10-27 {hour:02d}:00;{hour},5;{hour if hour != 9 else ''}" for hour in hours]
+    rows.insert(3, "2024-10-27 02:00;2,75;2")
+    (tmp_path / "prices.csv").write_text("\n".join(["time;p;q", *rows, ""]), encoding="utf-8")
+    (tmp_path / "task.toml").write_text(DATA, encoding="utf-8")
+    return tmp_path / "task.toml"
+
+
+def test_info_says_once_how_a_file_was_read(ran, task):
+    lines = ran("info", task).partition("\nData\n")[2].splitlines()
+    assert [line for line in lines if "prices.csv:" in line] == lines[1:2]
+    for fact in ("semicolons", "25 rows", "2024-10-27 23:00", "3600 s", "+01:00, +02:00", "Berlin"):
+        assert fact in lines[1]
+    assert lines[0].strip() == "standard time: +01:00 (the smallest offset in prices.csv)"
+    assert "decimal commas" in lines[2]
+    assert "1 values missing" in lines[3]
+    assert "7200 s" in lines[3]
+
+
+def test_info_as_json(ran, task):
+    data = json.loads(ran("info", task, "--json"))["data"]
+    assert data["standard_time"].startswith("+01:00")
+    first, second = data["series"]
+    assert (first["rows"], first["decimal_commas"], first["missing"]) == (25, True, 0)
+    assert (second["column"], second["missing"], second["longest_gap"]) == ("q", 1, 7200)
+
+
+def test_info_says_what_is_wrong_and_of_an_fmu_nothing(ran, task):
+    task.write_text(DATA.replace("prices", "prises", 1), encoding="utf-8")
+    out = ran("info", task)
+    assert "unknown file 'prises.csv'; did you mean 'prices.csv'?" in out
+    task.write_text(DATA.partition("[data]")[0] + DATA[DATA.index("[agent]") :], encoding="utf-8")
+    assert "\nData" not in ran("info", task)
+
+
+class TestJson:
+    @pytest.mark.parametrize("options", [[], ["--class"]])
+    def test_of_new(self, options, tmp_path, cli):
+        fmu = fmugym.bundled_fmu("Pendulum")
+        path = tmp_path / "out"
+        code, out, err = cli("new", fmu, *options, "--output", path, "--json")
+        facts = json.loads(out)
+        assert (code, err, facts["output"]) == (0, "", str(path))
+        text = path.read_text()
+        if options:
+            assert facts["program"] == text
+        else:
+            assert facts["task"] == tomllib.loads(text)
+            assert any("reward" in note for note in facts["notes"])
