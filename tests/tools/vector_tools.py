@@ -37,7 +37,12 @@ def in_each_mode(axes, hooks=HOOKS):
 
 
 def require_equal(first, second, rtol=0.0):
-    """Same types, shapes and values; dicts and arrays of objects element by element."""
+    """Same types, shapes and values; dicts, tuples and arrays of objects element by element."""
+    if isinstance(first, tuple):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            require_equal(one, other, rtol)
+        return
     if isinstance(first, Mapping):
         assert first.keys() == second.keys()
         for key in first:
@@ -45,8 +50,8 @@ def require_equal(first, second, rtol=0.0):
         return
     first, second = np.asarray(first), np.asarray(second)
     assert (first.dtype, first.shape) == (second.dtype, second.shape)
-    if rtol:
-        np.testing.assert_allclose(first, second, rtol=rtol, atol=0)
+    if rtol and first.dtype.kind == "f":
+        np.testing.assert_allclose(first, second, rtol=rtol, atol=rtol)
     else:
         np.testing.assert_array_equal(first, second)
 
@@ -74,7 +79,7 @@ def methods(envs, snapshot):
     }
 
 
-def require_same_infos(first, second):
+def require_same_infos(first, second, rtol=0.0):
     """What counts of an entry is only what its mask says."""
     assert first.keys() == second.keys()
     for key in first:
@@ -84,14 +89,14 @@ def require_same_infos(first, second):
         assert mask.dtype == second[f"_{key}"].dtype == np.bool_
         assert mask.tolist() == second[f"_{key}"].tolist(), key
         if isinstance(first[key], Mapping) and isinstance(second[key], Mapping):
-            require_same_infos(first[key], second[key])
+            require_same_infos(first[key], second[key], rtol)
             continue
         if isinstance(first[key], Mapping):  # the last observations, which Gymnasium has as objects
             for index in np.flatnonzero(mask):
-                require_equal(observation_of(first[key], index), second[key][index])
+                require_equal(observation_of(first[key], index), second[key][index], rtol)
             continue
         for left, right in zip(first[key][mask], second[key][mask], strict=True):
-            require_equal(left, right)
+            require_equal(left, right, rtol)
 
 
 def sampled_actions(env, count, seed=0):
