@@ -44,7 +44,8 @@ class Case(NamedTuple):
         ways: In which a vector environment can call its hooks.
         rtol: How far results may differ between a single environment and many.
         draws: Whether its episodes begin with drawn values.
-        can_save: Whether its episodes can be saved: hooks keep nothing in attributes.
+        can_save: Whether episodes keep all in their variables, so that they can be saved.
+        has_one_action: Whether an action is one array, as rollouts take them.
         has_faults: Whether episodes end by faults.
         usual: An action without a fault, where one of the actions leads to a fault.
         disturbing: That one.
@@ -55,6 +56,7 @@ class Case(NamedTuple):
     rtol: float = 0.0
     draws: bool = True
     can_save: bool = True
+    has_one_action: bool = True
     has_faults: bool = False
     usual: Any = None
     disturbing: Any = None
@@ -158,26 +160,6 @@ class OfOtherTypes(Drawing):
         return {"list": list(self.state), "wide": precise, "sign": sign, "pair": pair}
 
 
-class SharedArray(Drawing):
-    """Writes each observation to the same array."""
-
-    array = np.zeros(2, np.float32)
-
-    def _get_observation(self):
-        self.array[:] = self.state
-        return self.array
-
-
-class SharedDict(SharedArray):
-    """The same in a dict."""
-
-    def _get_observation_space(self):
-        return spaces.Dict({"all": wide(2)})
-
-    def _get_observation(self):
-        return {"all": super()._get_observation()}
-
-
 class Goal(Pushed):
     """A goal task with a float32 and a reward of a norm."""
 
@@ -212,8 +194,6 @@ OBSERVATIONS = {
     "observations are dicts in a dict": Case(Nested),
     "observations are tuples": Case(Pair, (EACH,)),
     "observations are of types that do not fit": Case(OfOtherTypes, (EACH,)),
-    "observations are in one array": Case(SharedArray, (EACH,)),
-    "observations are in a dict of one array": Case(SharedDict, (EACH,)),
     "goals": Case(Reaching),
     "goals of a float32": Case(Goal, rtol=ROUNDED),
 }
@@ -375,7 +355,7 @@ ACTIONS = {
         for name, space in ACTION_SPACES.items()
     },
     "actions begin at -1": Case(Shifted),
-    "actions are in parts": Case(ActionsInParts, (EACH,)),
+    "actions are in parts": Case(ActionsInParts, (EACH,), has_one_action=False),
     "actions choose from tables": Case(Tables, rtol=ROUNDED),
     **{
         f"inputs are {name}": Case(
@@ -384,7 +364,9 @@ ACTIONS = {
         for name, config in TYPES.items()
     },
     **{
-        f"inputs are {name} of all": Case(functools.partial(TwoTorques, form), (EACH,))
+        f"inputs are {name} of all": Case(
+            functools.partial(TwoTorques, form), (EACH,), can_save=False
+        )
         for name, form in FORMS.items()
     },
 }
@@ -622,11 +604,15 @@ VARIABLES = {
 # Attributes and constructors
 
 
+NARROW = {"x_threshold": 0.06}
+"""A parameter with which episodes of the cart-pole are short."""
+
+
 class Delegating(CART_POLE):
     """Keeps a bound method of its own in an attribute."""
 
     def __init__(self):
-        super().__init__()
+        super().__init__(model_parameters=NARROW)
         self.judge = self._lean
 
     def _lean(self):
@@ -738,7 +724,7 @@ ATTRIBUTES = {
     "an attribute refers to its environment": Case(Judged),
     "an attribute has a state": Case(Filtering, (EACH,), can_save=False),
     "a constructor uses other environments": Case(WithHelper, can_save=False),
-    "a constructor uses its environment": Case(UsesItself),
+    "a constructor uses its environment": Case(UsesItself, can_save=False),
 }
 
 
@@ -1029,7 +1015,7 @@ class TwoPendulums(fmugym.FMUEnv):
 
 
 OTHERS = {
-    "the cart-pole": Case(CART_POLE, ALL_WAYS),
+    "the cart-pole": Case(functools.partial(CART_POLE, model_parameters=NARROW), ALL_WAYS),
     "infos have a type of their own at starts": Case(Informing, (EACH,)),
     "a step has substeps, means and a warm-up": Case(Sampled, draws=False),
     "the FMU is a system": Case(TwoPendulums),

@@ -5,9 +5,10 @@ mode of autoreset. Episodes that nobody starts again are started by the tests.
 """
 
 import copy
+import itertools
 import logging
 from collections.abc import Mapping
-from itertools import islice, product
+from itertools import islice
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +19,7 @@ from vector_tools import require_equal, require_same_infos
 from ways import EXPRESSIONS, in_way
 
 from fmugym.environment.vector import FMUVectorEnv
+from fmugym.environment.vector.env_maker import make_with_pool
 
 COUNT, STEPS = 3, 30
 ALONE = "alone"
@@ -29,22 +31,28 @@ READINGS = (
 )
 
 
-def of_cases(*modes, alone=False, **wanted):
+def is_any(case):
+    """Every case."""
+    return True
+
+
+def of_cases(wanted=is_any, *, in_all_modes=False, modes=MODES, alone=False):
     """Parametrize a law with cases, ways of calling their hooks, and modes of autoreset.
 
     Args:
-        modes: Those in which each way is tried.
+        wanted: Whether the law is for a case.
+        in_all_modes: Each way is tried in all modes. Otherwise, these take turns.
+        modes: Of autoreset.
         alone: Whether single environments are tried, too.
-        wanted: What cases must have, by the names of attributes of ``Case``.
     """
-    rows = []
+    turns, rows = itertools.cycle(modes), []
     for name, case in CASES.items():
-        if all(getattr(case, attribute) == value for attribute, value in wanted.items()):
-            cells = [(ALONE, None)] if alone else []
-            cells += product(case.ways, modes)
+        cells = [(ALONE, None)] if alone else []
+        for way in case.ways:
+            cells += [(way, mode) for mode in (modes if in_all_modes else [next(turns)])]
+        if wanted(case):
             rows += [
-                pytest.param(case, way, mode, id="-".join(filter(None, (name, way, mode))))
-                for way, mode in cells
+                pytest.param(case, *cell, id="-".join(map(str, (name, *cell)))) for cell in cells
             ]
     return pytest.mark.parametrize(("case", "way", "mode"), rows)
 
@@ -72,8 +80,9 @@ def fixture_made(opened):
     return make
 
 
-def actions_for(case, env, steps=STEPS, seed=1):
+def actions_for(case, env, seed=1):
     """An action of each step, for a single environment or for many; some lead to faults."""
+    steps = STEPS if isinstance(env, gym.vector.VectorEnv) else COUNT * STEPS
     env.action_space.seed(seed)
     actions = [env.action_space.sample() for _ in range(steps)]
     if case.usual is None:
@@ -96,8 +105,9 @@ def started(env, ended):
         yield env.reset(options={"reset_mask": ended})
 
 
-def going_on(env, actions):
-    """What an environment returns from now on."""
+def going_on(env, actions, ended=False):
+    """What an environment returns from now on, where episodes may have ended."""
+    yield from started(env, ended)
     for action in actions:
         result = env.step(action)
         ended = np.array(result[2]) | np.array(result[3])
@@ -112,14 +122,20 @@ def played(env, actions, seed=3):
 
 
 def require_same(first, second):
-    """Equal to the last bit, with the same types, keys and shapes."""
+    """Equal to the last bit, with the same types, keys and shapes.
+
+    The text of a fault names an instance of the FMU, and its rate counts earlier episodes.
+    """
     if isinstance(first, Mapping):
         assert list(first) == list(second)
-        first, second = tuple(first.values()), tuple(second.values())
-    if isinstance(first, tuple) or getattr(first, "dtype", None) == object:
+        told = [name for name in first if name not in ("fault", "fault_rate")]
+        first, second = (tuple(one[name] for name in told) for one in (first, second))
+    if isinstance(first, (tuple, list)) or getattr(first, "dtype", None) == np.dtype("O"):
         assert len(first) == len(second)
         for one, other in zip(first, second, strict=True):
             require_same(one, other)
+    elif first is None or isinstance(first, str):
+        assert first == second
     else:
         require_equal(first, second)
 
@@ -144,9 +160,10 @@ def of_one(value, index):
     return value[index]
 
 
-def readings(envs):
-    """What attributes of the environments tell."""
-    return {name: envs.get_attr(name) for name in READINGS}
+def readings(env):
+    """What attributes tell, of a single environment or of many."""
+    read = getattr if isinstance(env, gym.Env) else type(env).get_attr
+    return {name: read(env, name) for name in READINGS}
 
 
 def close(first, second, rtol):
@@ -160,40 +177,44 @@ def close(first, second, rtol):
     return np.allclose(first, second, rtol=rtol, atol=rtol, equal_nan=True)
 
 
-def without_instances(infos):
-    """The infos of a step, without the name of the instance of the FMU in the text of a fault."""
+def with_plain_faults(infos):
+    """The infos of a step, in which a fault names no instance of the FMU and no numbers."""
     for one in (infos, infos.get("final_info", {})):
         if "fault" in one:
             texts = [text and text.split(": ", 1)[-1] for text in one["fault"]]
-            one["fault"] = np.array(texts, object)
+            plain = [text and text.partition("array(")[0] for text in texts]
+            one["fault"] = np.array(plain, object)
     return infos
 
 
-@of_cases(*MODES)
+@of_cases(in_all_modes=True)
 def test_each_environment_of_many_is_what_it_is_alone(case, way, mode, made, opened):
     """Gymnasium's ``SyncVectorEnv`` starts the episodes of the single ones."""
     ours = made(case, way, mode)
     theirs = opened(SyncVectorEnv([case.make] * COUNT, autoreset_mode=AutoresetMode[mode]))
     actions = actions_for(case, ours)
+    rtol = 0.0 if way == EXPRESSIONS else case.rtol
     ends = faults = 0
     results = zip(played(ours, actions), played(theirs, actions), strict=True)
     for number, (mine, other) in enumerate(results):
         for one, its in zip(mine[:-1], other[:-1], strict=True):
-            require_equal(one, its, case.rtol)
-        infos = without_instances(mine[-1])
-        require_same_infos(infos, without_instances(other[-1]), case.rtol)
+            require_equal(one, its, rtol)
+        infos = with_plain_faults(mine[-1])
+        if number == 0:
+            assert ours.observation_space.contains(mine[0])
+        require_same_infos(infos, with_plain_faults(other[-1]), rtol)
         if number % 5 == 4:  # and not always, because what nobody asks for is not computed
-            assert close(readings(ours), readings(theirs), case.rtol)
+            assert close(readings(ours), readings(theirs), rtol)
         if len(mine) == 5:
             ends += int(np.sum(mine[2] | mine[3]))
             faults += np.count_nonzero(infos.get("final_info", infos).get("_fault", False))
-    assert ends > COUNT
+    assert ends > 0
     assert (faults > 0) == case.has_faults
     for name in ("discards", "not_finite"):
         assert ours.health[name].tolist() == [env.health[name] for env in theirs.envs]
 
 
-@of_cases(*MODES, alone=True)
+@of_cases(lambda case: case.can_save, alone=True)
 def test_the_same_seed_repeats_everything(case, way, mode, made):
     """Also in the environment that has played before."""
     env, twin = made(case, way, mode), made(case, way, mode)
@@ -203,7 +224,7 @@ def test_the_same_seed_repeats_everything(case, way, mode, made):
     require_same_runs(played(env, actions), played(twin, actions))
 
 
-@of_cases(MODES[0], alone=True, draws=True)
+@of_cases(lambda case: case.draws, alone=True)
 def test_another_seed_draws_something_else(case, way, mode, made):
     env = made(case, way, mode)
     first, other = (copy.deepcopy(env.reset(seed=seed)[-1]["drawn"]) for seed in (3, 103))
@@ -211,97 +232,69 @@ def test_another_seed_draws_something_else(case, way, mode, made):
     assert any(np.any(first[name] != other[name]) for name in first if name[0] != "_")
 
 
-@of_cases(*MODES, alone=True, can_save=True)
+@of_cases(lambda case: case.can_save, alone=True)
 def test_an_episode_goes_on_from_its_snapshot_as_it_did(case, way, mode, made):
     """In another environment that was never reset, and in the one that has gone on."""
     env, other = made(case, way, mode), made(case, way, mode)
     actions = actions_for(case, env)
-    steps = played(env, actions)
-    list(islice(steps, 5))
+    *_, last = islice(played(env, actions), 4)
+    ended = np.array(last[2]) | np.array(last[3]) if len(last) == 5 else False
     snapshot = env.save_state()
-    went_on = copy.deepcopy(list(going_on(env, actions[5:])))
-    other.restore_state(snapshot)
-    require_same_runs(going_on(other, actions[5:]), went_on)
-    env.restore_state(snapshot)
-    require_same_runs(going_on(env, actions[5:]), went_on)
+    told = copy.deepcopy(readings(env))
+    went_on = copy.deepcopy(list(going_on(env, actions[4:], ended)))
+    for one in (other, env):
+        one.restore_state(snapshot)
+        assert close(readings(one), told, 0.0)
+        require_same_runs(going_on(one, actions[4:], ended), went_on)
 
 
-@of_cases(DISABLED, can_save=True)
-def test_a_rollout_gives_what_steps_give(case, way, mode, made, opened):
+@of_cases(lambda case: case.can_save and case.has_one_action, modes=[DISABLED])
+def test_a_rollout_gives_what_steps_give(case, way, mode, made):
     """From the present episodes, which go on afterwards as if it had not been."""
-    envs, single = made(case, way, mode), opened(case.make())
+    envs = made(case, way, mode)
     actions = actions_for(case, envs)
-    list(islice(played(envs, actions), 2))
+    *_, last = islice(played(envs, actions), 2)
+    list(started(envs, last[2] | last[3]))
     snapshot = envs.save_state()
-    candidates = [[of_one(step, index) for step in actions[2:]] for index in range(COUNT)]
-    if isinstance(actions[0], Mapping):
-        pytest.skip("rollouts take actions that make one array")
-    found = envs.rollout(None, np.array(candidates))
+    found = envs.rollout(None, np.stack(actions[2:], axis=1))
     assert envs.save_state() == snapshot
-    for index, candidate in enumerate(candidates):
-        single.restore_state(snapshot[index])
-        length = 0
-        over = False
-        while not over:
-            observation, *numbers, _ = single.step(candidate[length])
-            require_equal(of_one(of_one(found.observations, index), length), observation, case.rtol)
-            told = found.rewards, found.terminated, found.truncated
-            assert close(tuple(part[index, length] for part in told), tuple(numbers), case.rtol)
-            length += 1
-            over = any(numbers[1:])
-        assert found.lengths[index] == length
+    assert found.lengths.min() < len(actions) - 2
+    for number, action in enumerate(actions[2:]):
+        *result, _ = envs.step(action)
+        for index in np.flatnonzero(found.lengths > number):
+            rolled = tuple(of_one(of_one(part, index), number) for part in found[:4])
+            require_same(rolled, tuple(of_one(part, index) for part in result))
+        ended = result[2] | result[3]
+        assert ended[found.lengths == number + 1].all() or number + 1 == len(actions) - 2
+        list(started(envs, ended))
 
 
-def disturbed(actions, case, number, index=1):
-    """Actions of which one leads to a fault of one environment."""
-    given = [np.array(action) for action in actions]
-    given[number][index] = case.disturbing
-    return given
+FAULTY = 1
+"""The environment, and the step counted from zero."""
 
 
-FAULTY_STEP = 2
-
-
-def has_usual(case):
-    """Whether an action of the case leads to a fault."""
-    return case.usual is not None
-
-
-DISTURBED = {name: case for name, case in CASES.items() if has_usual(case)}
-
-
-@pytest.mark.parametrize(
-    ("case", "way", "mode"),
-    [
-        pytest.param(case, way, mode, id=f"{name}-{way}-{mode}")
-        for name, case in DISTURBED.items()
-        for way, mode in product(case.ways, MODES)
-    ],
-)
+@of_cases(lambda case: case.usual is not None, in_all_modes=True)
 def test_a_fault_ends_one_episode_and_no_other(case, way, mode, made):
-    """The others are those of a run without the fault; the one has its last good observation."""
+    """The others are those of a run without the fault."""
     envs, twin = made(case, way, mode), made(case, way, mode)
-    usual = [np.stack([case.usual] * COUNT)] * 9
-    given = disturbed(usual, case, FAULTY_STEP)
-    others = [0, 2]
-    before = None
-    with_fault, without = played(envs, given), played(twin, usual)
-    for number, (result, undisturbed) in enumerate(zip(with_fault, without, strict=False), -1):
-        for index in others:
+    usual = [np.stack([case.usual] * COUNT) for _ in range(9)]
+    given = copy.deepcopy(usual)
+    given[FAULTY][FAULTY] = case.disturbing
+    runs = (played(envs, given), played(twin, usual))
+    runs = [[result for result in run if len(result) == 5] for run in runs]
+    for result, undisturbed in zip(*runs, strict=True):
+        for index in set(range(COUNT)) - {FAULTY}:
             require_same(of_one(result, index), of_one(undisturbed, index))
-        if number == FAULTY_STEP:
-            break
-        before = result[0]
-    policy = envs.prototype.config.on_fault
-    assert [bool(flag[1]) for flag in result[2:4]] == [policy == "terminate", policy == "truncate"]
-    told = result[4].get("final_info", result[4])
-    assert told["_fault"].tolist() == [False, True, False]
-    last = result[4]["final_obs"] if "final_obs" in result[4] else result[0]
-    require_equal(of_one(last, 1), of_one(before, 1))
-    assert result[1][1] == envs.prototype.config.fault_reward
+    _, rewards, *ends, infos = runs[0][FAULTY]
+    config = envs.prototype.config
+    policies = {"terminate": [True, False], "truncate": [False, True]}
+    assert [flags[FAULTY] for flags in ends] == policies[config.on_fault]
+    assert rewards[FAULTY] == config.fault_reward
+    told = infos.get("final_info", infos)
+    assert told["_fault"].tolist() == [index == FAULTY for index in range(COUNT)]
 
 
-@of_cases(*MODES, alone=True)
+@of_cases(alone=True)
 def test_what_a_caller_holds_does_not_change(case, way, mode, made):
     """Whether it is read at once or after all steps."""
     env, twin = made(case, way, mode), made(case, way, mode)
@@ -310,21 +303,27 @@ def test_what_a_caller_holds_does_not_change(case, way, mode, made):
     require_same_runs(kept, [copy.deepcopy(result) for result in played(twin, actions)])
 
 
-@of_cases(*MODES, alone=True)
+@of_cases(alone=True)
 def test_what_a_caller_changes_does_not_come_back(case, way, mode, made):
     """Neither in results nor in actions."""
     careful, careless = made(case, way, mode), made(case, way, mode)
     actions = actions_for(case, careful)
 
-    def spoiling():
-        given = [copy.deepcopy(action) for action in actions]
-        for number, result in enumerate(played(careless, given)):
-            yield copy.deepcopy(result)
-            for array in arrays_of((result, given[:number])):
-                if array.flags.writeable:
-                    array[...] = None if array.dtype == object else 1
+    used = []
 
-    require_same_runs(played(careful, actions), spoiling())
+    def given():
+        for action in actions:
+            used.append(copy.deepcopy(action))
+            yield used[-1]
+
+    def spoiled():
+        for result in played(careless, given()):
+            yield copy.deepcopy(result)
+            for array in arrays_of((result, used)):
+                array[...] = None if array.dtype == object else 1
+
+    require_same_runs(played(careful, actions), spoiled())
+    assert close(readings(careful), readings(careless), 0.0)
 
 
 def arrays_of(value):
@@ -336,27 +335,40 @@ def arrays_of(value):
     return [value] if isinstance(value, np.ndarray) else []
 
 
-@of_cases(DISABLED)
+@of_cases(modes=[DISABLED])
 def test_a_reset_with_a_mask_leaves_the_others_as_they_are(case, way, mode, made):
     envs, twin = made(case, way, mode), made(case, way, mode)
-    actions = actions_for(case, envs, 8)
-    results = [list(islice(played(env, actions), 2)) for env in (envs, twin)]
-    seen = results[0][-1][0]
+    actions = actions_for(case, envs)
+    *_, last = (list(islice(played(env, actions), 2))[-1] for env in (twin, envs))
+    mask, others = np.array([False, True, False]), (0, 2)
     before = readings(envs)
-    mask = np.array([False, True, False])
     again, infos = envs.reset(options={"reset_mask": mask})
     assert infos.get("_drawn", mask).tolist() == mask.tolist()
     after = readings(envs)
-    for index in (0, 2):
-        require_equal(of_one(again, index), of_one(seen, index))
-        assert close(of_one(after, index), of_one(before, index), 0.0)
     assert after["step_count"][1] == 0
-    steps = 0
-    for action in actions[2:]:
-        one, other = envs.step(action), twin.step(action)
-        for index in (0, 2):
+    for index in others:
+        require_equal(of_one(again, index), of_one(last[0], index))
+        for name in READINGS:
+            assert close(after[name][index], before[name][index], 0.0)
+    ended = last[2] | last[3]
+    for env in (envs, twin):
+        list(started(env, ended & ~mask if env is envs else ended))
+    for _ in range(2):
+        one, other = envs.step(actions[2]), twin.step(actions[2])
+        for index in others:
             require_same(of_one(one, index), of_one(other, index))
-        steps += 1
-        if np.any([flag for result in (one, other) for flag in result[2:4]]):
-            break
-    assert steps > 0
+        for env, result in ((envs, one), (twin, other)):
+            list(started(env, result[2] | result[3]))
+
+
+@of_cases(modes=MODES, alone=True)
+def test_worker_processes_change_nothing(case, way, mode, made, opened):
+    """Not in the last bit."""
+    here = made(case, way, mode)
+    if way == ALONE:
+        isolated = opened(make_with_pool(case.make, isolation="process"))
+    else:
+        isolated = made(case, way, mode, isolation="process", workers=2)
+    actions = actions_for(case, here)
+    require_same_runs(played(isolated, actions), played(here, actions))
+    assert close(readings(isolated), readings(here), 0.0)
