@@ -45,6 +45,7 @@ class Case(NamedTuple):
         rtol: How far results may differ between a single environment and many.
         draws: Whether its episodes begin with drawn values.
         can_save: Whether episodes keep all in their variables, so that they can be saved.
+        not_restored: The reason why another environment cannot restore its episodes yet.
         has_one_action: Whether an action is one array, as rollouts take them.
         has_faults: Whether episodes end by faults.
         usual: An action without a fault, where one of the actions leads to a fault.
@@ -56,6 +57,7 @@ class Case(NamedTuple):
     rtol: float = 0.0
     draws: bool = True
     can_save: bool = True
+    not_restored: str = ""
     has_one_action: bool = True
     has_faults: bool = False
     usual: Any = None
@@ -581,17 +583,21 @@ def writing(hook):
     return Writing
 
 
+DISTRIBUTIONS = "configs with distributions in arrays are never those of other environments"
 VARIABLES = {
     "sums are made in place": Case(Summing),
     "variables are swapped": Case(Swapping),
     "variables change their types": Case(Changing),
     "a variable is an index": Case(Queueing),
-    "variables hold several numbers": Case(Historic),
+    "variables hold several numbers": Case(
+        Historic, not_restored="on arrays, no variable is restored that was a number at the start"
+    ),
     "a target is drawn": Case(Tracking, rtol=ROUNDED),
     "variables hold histories": Case(Delayed, rtol=ROUNDED),
-    "elements are drawn": Case(Targets),
+    "elements are drawn": Case(Targets, not_restored=DISTRIBUTIONS),
     "elements are drawn by Python alone": Case(
         functools.partial(Targets, {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}),
+        not_restored=DISTRIBUTIONS,
     ),
     **{
         f"{hook} writes a variable": Case(writing(hook), (EACH,), can_save=False)
@@ -957,20 +963,7 @@ FAULTS = {
 }
 
 
-# Lengths, times, systems and infos
-
-
-class Informing(Drawing):
-    """Has infos that are whole numbers at the start of an episode and halves later."""
-
-    def __init__(self):
-        super().__init__(episode_variables={"limit": Choice([2, 3])})
-
-    def _is_done(self):
-        return self.step_count >= self.variables["limit"]
-
-    def _get_info(self):
-        return {"part": self.step_count / 2 if self.step_count else 0}
+# Lengths, times and systems
 
 
 class Sampled(fmugym.FMUEnv):
@@ -1016,7 +1009,6 @@ class TwoPendulums(fmugym.FMUEnv):
 
 OTHERS = {
     "the cart-pole": Case(functools.partial(CART_POLE, model_parameters=NARROW), ALL_WAYS),
-    "infos have a type of their own at starts": Case(Informing, (EACH,)),
     "a step has substeps, means and a warm-up": Case(Sampled, draws=False),
     "the FMU is a system": Case(TwoPendulums),
 }
@@ -1088,6 +1080,11 @@ def task(of, **changes):
 
 EXPRESSED = {
     "the cart-pole of a file": Case(task(EXAMPLES / "cart_pole.toml"), ALL_WAYS),
+    "the pendulum of a file": Case(
+        task({"extends": str(EXAMPLES / "pendulum.toml"), "episode_length": "0.5s"}),
+        ALL_WAYS,
+        ROUNDED,
+    ),
     "a task has memory": Case(task(PENDULUM), ALL_WAYS, ROUNDED),
     "a task observes outputs": Case(task(PENDULUM, **OUTPUTS), ALL_WAYS, ROUNDED),
     "a task pays for its end": Case(task(WITH_DONE), ALL_WAYS, ROUNDED),

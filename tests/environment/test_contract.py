@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 from contract_cases import CASES
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from vector_tools import require_equal, require_same_infos
+from gymnasium.vector.utils import concatenate, create_empty_array
+from vector_tools import of_one, require_equal, require_same_infos
 from ways import EXPRESSIONS, in_way
 
 from fmugym.environment.vector import FMUVectorEnv
@@ -149,21 +150,22 @@ def require_same_runs(first, second):
     assert ends > 0
 
 
-def of_one(value, index):
-    """The part of results that belongs to one of many environments."""
-    if isinstance(value, Mapping):
-        masks = {name: value.get(f"_{name}") for name in value if not name.startswith("_")}
-        told = (name for name, mask in masks.items() if mask is None or mask[index])
-        return {name: of_one(value[name], index) for name in told}
-    if isinstance(value, tuple):
-        return tuple(of_one(part, index) for part in value)
-    return value[index]
-
-
 def readings(env):
     """What attributes tell, of a single environment or of many."""
     read = getattr if isinstance(env, gym.Env) else type(env).get_attr
-    return {name: read(env, name) for name in READINGS}
+    return {name: taken(read(env, name)) for name in READINGS}
+
+
+def taken(value):
+    """A copy, also of mappings that show the present values."""
+    if isinstance(value, Mapping):
+        return {name: taken(part) for name, part in value.items()}
+    return tuple(map(taken, value)) if isinstance(value, tuple) else copy.copy(value)
+
+
+def of_space(space, observation):
+    """An observation in the types of its space, as Gymnasium stores it."""
+    return of_one(concatenate(space, [observation], create_empty_array(space, 1)), 0)
 
 
 def close(first, second, rtol):
@@ -199,12 +201,16 @@ def test_each_environment_of_many_is_what_it_is_alone(case, way, mode, made, ope
     for number, (mine, other) in enumerate(results):
         for one, its in zip(mine[:-1], other[:-1], strict=True):
             require_equal(one, its, rtol)
+        for index in np.flatnonzero(other[-1].get("_final_obs", ())):
+            last = other[-1]["final_obs"]
+            last[index] = of_space(ours.single_observation_space, last[index])
         infos = with_plain_faults(mine[-1])
         if number == 0:
             assert ours.observation_space.contains(mine[0])
         require_same_infos(infos, with_plain_faults(other[-1]), rtol)
         if number % 5 == 4:  # and not always, because what nobody asks for is not computed
             assert close(readings(ours), readings(theirs), rtol)
+            assert {type(flag) for flag in ours.get_attr("done")} == {bool}
         if len(mine) == 5:
             ends += int(np.sum(mine[2] | mine[3]))
             faults += np.count_nonzero(infos.get("final_info", infos).get("_fault", False))
@@ -233,14 +239,16 @@ def test_another_seed_draws_something_else(case, way, mode, made):
 
 
 @of_cases(lambda case: case.can_save, alone=True)
-def test_an_episode_goes_on_from_its_snapshot_as_it_did(case, way, mode, made):
+def test_an_episode_goes_on_from_its_snapshot_as_it_did(case, way, mode, made, request):
     """In another environment that was never reset, and in the one that has gone on."""
+    if case.not_restored:
+        request.applymarker(pytest.mark.xfail(reason=case.not_restored, strict=False))
     env, other = made(case, way, mode), made(case, way, mode)
     actions = actions_for(case, env)
     *_, last = islice(played(env, actions), 4)
     ended = np.array(last[2]) | np.array(last[3]) if len(last) == 5 else False
     snapshot = env.save_state()
-    told = copy.deepcopy(readings(env))
+    told = readings(env)
     went_on = copy.deepcopy(list(going_on(env, actions[4:], ended)))
     for one in (other, env):
         one.restore_state(snapshot)
@@ -303,9 +311,9 @@ def test_what_a_caller_holds_does_not_change(case, way, mode, made):
     require_same_runs(kept, [copy.deepcopy(result) for result in played(twin, actions)])
 
 
-@of_cases(alone=True)
+@of_cases()
 def test_what_a_caller_changes_does_not_come_back(case, way, mode, made):
-    """Neither in results nor in actions."""
+    """Neither in results nor in actions; a single environment returns arrays of its hooks."""
     careful, careless = made(case, way, mode), made(case, way, mode)
     actions = actions_for(case, careful)
 
