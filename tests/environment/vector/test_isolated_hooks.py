@@ -6,15 +6,11 @@ import signal
 import exchange_tools
 import numpy as np
 import pytest
-from combinations import in_turn
-from gymnasium.vector import AutoresetMode
 from process_tools import FaultyEnv, faulty_fmu, start_values
-from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
     CART_POLE,
     Drawing,
     require_equal,
-    results_of_both,
 )
 from ways import in_way
 
@@ -43,61 +39,6 @@ class Short(Drawing):
 
     def __init__(self):
         super().__init__(max_episode_steps=7)
-
-
-class Sampled(fmugym.FMUEnv):
-    """What else the config may ask of a step."""
-
-    def __init__(self):
-        config = {
-            "model_input_names": "f",
-            "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
-            "bounds": {"f": (-20, 20)},
-            "time_step": 0.02,
-            "substeps": 2,
-            "warm_up": 0.1,
-            "start_time": 3.0,
-            "samplings": {"x": "mean"},
-            "monitor_names": ["phi_ddot"],
-        }
-        super().__init__(fmugym.bundled_fmu("CartPole"), config)
-
-    def _is_done(self):
-        return np.abs(self.state[2]) > 0.2
-
-
-class TwoPendulums(fmugym.FMUEnv):
-    """A system."""
-
-    def __init__(self):
-        pendulum = fmugym.bundled_fmu("Pendulum")
-        config = {
-            "model_input_names": "a.tau",
-            "model_output_names": ["a.theta", "b.theta"],
-            "model_parameters": {"a.theta_0": fmugym.Uniform(-0.1, 0.1), "b.theta_0": 0.3},
-            "bounds": {"a.tau": (-0.1, 0.1)},
-            "time_step": 0.02,
-            "max_episode_steps": 9,
-        }
-        super().__init__(fmugym.FMUSystem({"a": pendulum, "b": pendulum}, []), config)
-
-    def _is_done(self):
-        return np.abs(self.state[0]) > 3.0
-
-
-@in_turn(
-    {
-        "cls": [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables],
-        "mode": list(AutoresetMode),
-    }
-)
-def test_results_are_those_of_one_process(make, cls, mode):
-    """To the last bit, with episodes that start in every way."""
-    isolated = make(cls, 70, autoreset_mode=mode)
-    here = make(cls, 70, workers=None, autoreset_mode=mode)
-    list(results_of_both(isolated, here))
-    for name in ("variables", "previous_state", "action", "inputs", "step_count"):
-        np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
 
 
 def test_a_process_that_is_killed(make):

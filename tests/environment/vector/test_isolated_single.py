@@ -6,31 +6,13 @@ from pathlib import Path
 
 import pytest
 from process_tools import linux_only, wait_until
-from test_isolated_hooks import Sampled, TwoPendulums
 from test_single_expressions import (
-    require_same,
     require_same_steps,
     same,
 )
-from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from ways import in_python
 
 import fmugym
-from fmugym.environment.vector.env_maker import make_with_pool
-from fmugym.pool.processes.process_pool import ProcessPool
-
-
-def isolated(make_env):
-    """A new environment with a worker process."""
-    env = make_with_pool(make_env, isolation="process")
-    assert isinstance(env.pool, ProcessPool)
-    return env
-
-
-def here(make_env):
-    """The same in this process, in Python."""
-    env = make_env()
-    return in_python(env)
 
 
 @pytest.fixture(name="cart")
@@ -40,23 +22,6 @@ def fixture_cart():
     env.step(0)
     yield env
     env.close()
-
-
-BUNDLED = [
-    fmugym.envs.CartPoleEnv,
-    fmugym.envs.PendulumEnv,
-    fmugym.envs.ModelicaCartPoleEnv,
-    fmugym.envs.CloudPendulumEnv,
-]
-
-
-@pytest.mark.parametrize("cls", [*BUNDLED, Tracking, Delayed, Goal, Tables, Sampled, TwoPendulums])
-def test_results_are_those_of_one_process(cls):
-    """With everything that hooks read."""
-
-    one = cls(isolation="process") if cls in BUNDLED else isolated(cls)
-    with one, here(cls) as other:
-        require_same(one, other, steps=120)
 
 
 def test_a_process_that_is_killed(cart):

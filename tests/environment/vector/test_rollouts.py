@@ -1,6 +1,5 @@
 """Rollouts: what candidates would lead to equals what single environments do from a snapshot."""
 
-import gymnasium
 import numpy as np
 import pytest
 from combinations import in_turn
@@ -101,25 +100,6 @@ class TestValues:
             assert rows_of(found) == one_by_one(env, before, actions)
         observations, *_ = envs.step(actions[:, 0])
         assert observations.tolist() == found.observations[:, 0].tolist()
-
-    def test_of_observations_that_are_dicts(self, vector_of):
-        class Named(Track):
-            def _get_observation_space(self):
-                box = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-                return gymnasium.spaces.Dict({"q": box, "u": box})
-
-            def _get_observation(self):
-                return {"q": np.stack([self.out["q"]]), "u": np.stack([self.inputs[0]])}
-
-        env = halfway(Named)
-        actions, snapshot = actions_for(env), env.save_state()
-        results = []
-        for hooks in ("arrays", "one by one"):
-            envs = vector_of(in_way(hooks, Named), 3)
-            found = envs.rollout(snapshot, actions)
-            results.append([found.observations[name].tolist() for name in ("q", "u")])
-            assert found.observations["q"].shape == (N, HORIZON, 1)
-        assert results[0] == results[1]
 
     @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_of_a_policy(self, hooks, vector_of):

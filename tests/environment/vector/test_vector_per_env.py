@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from contract_cases import FORMS, TwoTorques
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
 from vector_tools import (
     Drawing,
     make_pair,
@@ -12,7 +12,8 @@ from vector_tools import (
 from ways import in_way
 
 import fmugym
-from fmugym import ConfigError
+from fmugym import Choice, ConfigError
+from fmugym.environment.vector import FMUVectorEnv
 
 
 class SharedArray(Drawing):
@@ -47,35 +48,6 @@ def test_an_array_that_hooks_share_does_not_mix_the_observations(cls, make_envs)
     assert len(set(rows[:, 0])) == 3
     first = seen[0] if cls is SharedArray else seen[0]["all"]
     assert not np.array_equal(first, rows)  # a later step leaves earlier observations alone
-
-
-class OfOtherTypes(Drawing):
-    """Observations as hooks may return them: lists, float64, and a number for a Discrete."""
-
-    def _get_observation_space(self):
-        box = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        parts = {"list": box, "wide": box, "sign": spaces.Discrete(2), "pair": spaces.Tuple([box])}
-        return spaces.Dict(parts)
-
-    def _get_observation(self):
-        wide = np.array(self.state)
-        return {
-            "list": list(self.state),
-            "wide": wide,
-            "sign": int(self.state[0] > 0),
-            "pair": (wide.astype(np.float32),),
-        }
-
-
-def test_observations_become_the_types_of_their_space(make_envs):
-    envs = make_envs(in_way("one by one", OfOtherTypes), 3)
-    envs.reset(seed=0)
-    seen = envs.step(np.zeros((3, 1), np.float32))[0]
-    states = np.float32(envs.get_attr("state"))
-    assert seen in envs.observation_space
-    for rows in (seen["list"], seen["wide"], seen["pair"][0]):
-        np.testing.assert_array_equal(rows, states)
-    np.testing.assert_array_equal(seen["sign"], states[:, 0] > 0)
 
 
 class Observing(Drawing):
@@ -121,53 +93,6 @@ def test_a_step_that_one_environment_refuses_changes_none(make_envs):
     np.testing.assert_array_equal(envs.pool.inputs, given)
 
 
-class Breaking(Drawing):
-    """The observation, in one of several forms, or the reward breaks at an angle."""
-
-    form = "arrays"
-
-    def __init__(self):
-        starts = {"q_0": fmugym.Uniform(0.2, 1.0)}
-        changes = {"episode_variables": {"sum": 0.0}, "max_episode_steps": 30}
-        super().__init__(model_parameters=starts, **changes)
-
-    def _get_observation_space(self):
-        box = spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        return spaces.Dict({"one": box, "two": box}) if self.form == "dict" else box
-
-    def _update(self):
-        self.variables["sum"] += self.state[0]
-
-    def _is_done(self):
-        return self.state[0] < 0.1
-
-    def _reward_policy(self):
-        breaks = self.form == "reward" and self.state[0] < 0.1
-        return np.float64(np.nan if breaks else self.variables["sum"])
-
-    def _get_observation(self):
-        q, q_dot = self.state
-        seen = np.float32([q_dot, np.inf if q < 0.1 and self.form != "reward" else q])
-        if self.form == "dict":
-            return {"one": np.float32(self.state), "two": seen}
-        return seen.tolist() if self.form == "list" else seen
-
-
-@pytest.mark.parametrize("form", ["arrays", "list", "dict", "reward"])
-def test_a_number_that_breaks_is_a_fault_as_in_single_environments(form, monkeypatch):
-    """Also where the hooks end the episode in that step; the variables are as before it."""
-    monkeypatch.setattr(Breaking, "form", form)
-    ours, theirs = make_pair(Breaking, AutoresetMode.DISABLED, 6, "one by one")
-    faults = 0
-    for result in results_of_both(ours, theirs, [np.zeros((6, 1), np.float32)] * 25, seed=0):
-        faults += np.count_nonzero(result[4].get("_fault", False))
-        for name in ("variables", "state"):
-            assert ours.get_attr(name) == theirs.get_attr(name)
-    assert faults >= 6
-    ours.close()
-    theirs.close()
-
-
 class Replacing(Drawing):
     """A method replaces the default hook."""
 
@@ -193,19 +118,92 @@ class Informing(Drawing):
     """Infos are whole numbers at the start of an episode and halves later."""
 
     def __init__(self):
-        super().__init__(max_episode_steps=2)
+        super().__init__(episode_variables={"limit": Choice([2, 3])}, max_episode_steps=9)
+
+    def _is_done(self):
+        return self.step_count >= self.variables["limit"]
 
     def _get_info(self):
         return {"part": self.step_count / 2 if self.step_count else 0}
 
 
 def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments(make_envs):
-    envs = make_envs(in_way("one by one", Informing), 2, autoreset_mode="next_step")
+    envs = make_envs(in_way("one by one", Informing), 3, autoreset_mode="next_step")
     envs.reset(seed=0)
-    actions = np.zeros((2, 1), np.float32)
-    envs.step(actions)
-    envs.episodes.ended[:] = [False, True]
-    envs.episodes.any_ended = True
-    infos = envs.step(actions)[-1]
-    assert infos["part"].tolist() == [1.0, 0.0]
-    assert infos["part"].dtype == np.float64
+    mixed = 0
+    for actions in np.zeros((12, 3, 1), np.float32):
+        part = envs.step(actions)[-1]["part"]
+        steps = np.array(envs.get_attr("step_count"))
+        assert part.tolist() == (steps / 2).tolist()
+        mixed += steps.min() == 0 < steps.max()
+    assert mixed > 0
+
+
+class Torques(TwoTorques):
+    """Notes when it is asked for infos; the reward of an environment breaks in step ``broken``."""
+
+    broken = 0
+
+    def __init__(self):
+        super().__init__()
+        self.informed = []
+
+    def _reward_policy(self):
+        return np.nan if self.step_count == self.broken else 1.0
+
+    def _get_info(self):
+        self.informed.append(self.step_count)
+        return super()._get_info()
+
+
+ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (4, len(FORMS), 2)).astype(np.float32)
+
+
+def test_inputs_of_several_forms_are_those_of_single_environments():
+    """An array that all environments return must not mix their inputs."""
+    ours, theirs = make_pair(Torques, num_envs=len(FORMS), way="one by one")
+    for envs in (ours, theirs):
+        envs.set_attr("form", list(FORMS.values()))
+    for _ in results_of_both(ours, theirs, list(ACTIONS)):
+        assert ours.get_attr("inputs") == theirs.get_attr("inputs")
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("form", [None, np.float32, list])
+def test_an_input_that_is_not_finite_names_its_environment(form, make_envs):
+    envs = make_envs(in_way("one by one", Torques), 3)
+    envs.reset(seed=0)
+    envs.set_attr("form", form)
+    envs.step(ACTIONS[0][:3])
+    before = [envs.get_attr(name) for name in ("inputs", "action", "previous_action", "state")]
+    envs.set_attr("form", [form, lambda values: np.array([values[0], np.inf]), form])
+    with pytest.raises(ConfigError, match=r"environment 1: .*tau2 = inf"):
+        envs.step(ACTIONS[1][:3])
+    after = [envs.get_attr(name) for name in ("inputs", "action", "previous_action", "state")]
+    for old, new in zip(before, after, strict=True):
+        np.testing.assert_array_equal(old, new)
+    envs.set_attr("form", form)
+    envs.step(ACTIONS[1][:3])
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
+def test_infos_are_asked_for_as_in_a_single_environment(mode):
+    """The info of a fault is asked for once, in the state before the step."""
+    envs = FMUVectorEnv(in_way("one by one", Torques), 3, autoreset_mode=mode)
+    alone = Torques()
+    envs.reset(seed=0)
+    alone.reset(seed=1)
+    envs.set_attr("broken", [0, 2, 0])
+    alone.broken = 2
+    for actions in ACTIONS[:2]:
+        *_, infos = envs.step(actions[:3])
+        *_, info = alone.step(actions[1])
+    asked = envs.get_attr("informed")
+    restarts = [0] if mode == "same_step" else []
+    assert list(asked) == [[0, 1, 2], [*alone.informed, *restarts], [0, 1, 2]]
+    last = infos["final_info"] if mode == "same_step" else infos
+    assert (last["first"][1], last["steps"][1]) == (info["first"], info["steps"])
+    assert last["fault"][1] == info["fault"]
+    for env in (envs, alone):
+        env.close()
