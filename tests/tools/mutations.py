@@ -38,8 +38,9 @@ SUITES: Final[Mapping[str, Suite]] = {
     "environment": (
         "tests/environment/vector/test_order_of_step.py",
         "tests/golden/test_golden_tasks.py",
+        "tests/environment/test_contract.py",
         "-k",
-        "not exported and not training",
+        "not exported and not training and not worker_processes",
     ),
     "expressions": ("tests/expressions",),
 }
@@ -219,6 +220,77 @@ MUTATIONS: Final = (
         "arrays.variables[name][...] = arrays.before[name]",
         "arrays.before[name][...] = arrays.variables[name]",
         "a single environment updates its memory twice in the step of a fault",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/hook_tasks.py",
+        "taken = np.array(super()._checked(actions, idle))",
+        "taken = np.asarray(super()._checked(actions, idle))",
+        "who uses an array of actions again changes the action before, which hooks on arrays read",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/hook_tasks.py",
+        "iterate(self._action_space, copy.deepcopy(actions))",
+        "iterate(self._action_space, actions)",
+        "who uses actions in parts again changes the action before, which hooks read",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/hook_tasks.py",
+        "return value if is_apart else value.copy()",
+        "return value",
+        "two variables that are swapped on arrays become one",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/hook_tasks.py",
+        "return array.astype(dtype, copy=False)",
+        "return array",
+        "an episode begins with 0 where another one has made a whole number of a 0.5",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/hook_tasks.py",
+        "        if self._idle is not None and self._idle.any():\n"
+        "            self.episodes.restore_variables(self._idle)\n",
+        "",
+        "with next_step, memory begins with an update without a step",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/hook_tasks.py",
+        "            found &= self._busy\n",
+        "            pass\n",
+        "an episode that begins where the task ends is told to be done at once",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/array_faults.py",
+        "result.rewards[faulty] = array_results.rewards(env._fault_reward(), count)[faulty]",
+        "result.rewards[:] = array_results.rewards(env._fault_reward(), count)",
+        "where one FMU fails, all environments get the reward of a fault",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/array_faults.py",
+        'env.done[faulty] = on_fault == "terminate"',
+        "env.done[faulty] = True",
+        "an episode that a fault has cut short is told to be done",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/array_episodes.py",
+        '            self.streams.put(where, columns["streams"][whence], seeds)\n',
+        "            seeds.flags.writeable = False\n",
+        "the episodes after a restored one begin with other values than they did",
+    ),
+    Mutation(
+        "environment",
+        "environment/vector/array_episodes.py",
+        "        read.action[..., indices] = np.asarray(action)[..., np.newaxis]\n",
+        "",
+        "the action before the first one is the last of the episode before",
     ),
     # Expressions
     Mutation(
