@@ -380,11 +380,9 @@ ACTIONS = {
 class Summing(Drawing):
     """Adds to variables in place, as one writes sums in Python."""
 
-    def __init__(self):
-        super().__init__(
-            episode_variables={"sum": 0.0, "left": Uniform(0.0, 1.0), "count": 0},
-            monitor_names=["theta_ddot"],
-        )
+    def __init__(self, **changes):
+        variables = {"sum": 0.0, "left": Uniform(0.0, 1.0), "count": 0}
+        super().__init__(episode_variables=variables, monitor_names=["theta_ddot"], **changes)
 
     def _update(self):
         self.variables["sum"] += self.state[0]
@@ -411,8 +409,8 @@ class Swapping(Drawing):
 
     def _update(self):
         one, other, pair = self.variables["one"], self.variables["other"], self.variables["pair"]
-        self.variables["one"], self.variables["other"] = other, one + self.state[0]
-        self.variables["pair"] = np.stack([pair[1], one + 0.0 * pair[0]])
+        self.variables["one"], self.variables["other"] = other, one
+        self.variables["pair"] = np.stack([pair[1] + self.state[0], one + 0.0 * pair[0]])
 
     def _reward_policy(self):
         pair = self.variables["pair"]

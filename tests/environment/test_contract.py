@@ -128,7 +128,7 @@ def require_same(first, second):
     The text of a fault names an instance of the FMU, and its rate counts earlier episodes.
     """
     if isinstance(first, Mapping):
-        assert list(first) == list(second)
+        assert first.keys() == second.keys()
         told = [name for name in first if name not in ("fault", "fault_rate")]
         first, second = (tuple(one[name] for name in told) for one in (first, second))
     if isinstance(first, (tuple, list)) or getattr(first, "dtype", None) == np.dtype("O"):

@@ -223,10 +223,10 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "environment",
-        "environment/vector/hook_tasks.py",
-        "taken = np.array(super()._checked(actions, idle))",
-        "taken = np.asarray(super()._checked(actions, idle))",
-        "who uses an array of actions again changes the action before, which hooks on arrays read",
+        "environment/step_result.py",
+        "variables = read.variables.copy() if env._own_hooks.update else None",
+        "variables = None",
+        "a single environment with hooks keeps the update of a step that a fault has undone",
     ),
     Mutation(
         "environment",

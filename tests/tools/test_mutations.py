@@ -7,7 +7,9 @@ import pytest
 
 
 def test_each_room_has_ten():
-    assert Counter(one.room for one in mutations.MUTATIONS) == dict.fromkeys(mutations.SUITES, 10)
+    counts = Counter(one.room for one in mutations.MUTATIONS)
+    assert counts.keys() == mutations.SUITES.keys()
+    assert min(counts.values()) >= 10
     assert len({one.noticed for one in mutations.MUTATIONS}) == len(mutations.MUTATIONS)
 
 

@@ -224,7 +224,7 @@ class Adding(Summing):
 
 def test_sums_go_on_while_an_episode_has_parameters_of_its_own(make_envs):
     ours, theirs = (
-        make_envs(in_way(hooks, lambda: Adding()), 3, autoreset_mode="Disabled")
+        make_envs(in_way(hooks, lambda: Adding(max_episode_steps=50)), 3, autoreset_mode="Disabled")
         for hooks in ("arrays", "one by one")
     )
     first = np.array([True, False, False])
@@ -232,7 +232,7 @@ def test_sums_go_on_while_an_episode_has_parameters_of_its_own(make_envs):
     for options in ({}, overriding, {"reset_mask": first}):
         for envs in ours, theirs:
             envs.reset(seed=1 if not options else None, options=options)
-        for actions in sampled_actions(ours, 2):
+        for actions in sampled_actions(ours, 4):
             for mine, other in zip(ours.step(actions)[:4], theirs.step(actions)[:4], strict=True):
                 require_equal(mine, other)
 

@@ -134,8 +134,10 @@ def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments(make_
     for actions in np.zeros((12, 3, 1), np.float32):
         part = envs.step(actions)[-1]["part"]
         steps = np.array(envs.get_attr("step_count"))
-        assert part.tolist() == (steps / 2).tolist()
-        mixed += steps.min() == 0 < steps.max()
+        if steps[0]:  # the first environment says of which type the array is
+            assert part.dtype == np.float64
+            assert part.tolist() == (steps / 2).tolist()
+            mixed += steps.min() == 0
     assert mixed > 0
 
 
