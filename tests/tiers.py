@@ -122,7 +122,7 @@ WITHOUT_EXTENSION = {
 """Modules that run where the C extension was not built, but for tests with ``engine``."""
 
 EVERY = {
-    "test_contract": 13,
+    "test_contract": 17,
     "test_golden_tasks": 8,
     "test_hostile_archive": 19,
     "test_pool": 7,
@@ -135,7 +135,6 @@ EVERY_OF_OTHERS = 61
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
-    "test_contract": 5,
     "test_golden_tasks": 1,
     "test_export_search": 3,
     "test_declared_physical": 3,
@@ -215,7 +214,7 @@ SLOW_TESTS = (
     "test_isolated_rollouts.py::test_a_rollout",
     "test_isolated_rollouts.py::test_faults",
     "test_isolated_rollouts.py::test_results",
-    "test_isolated_single.py::test_interrupts",
+    "test_isolated_environments.py::test_interrupts",
     "test_native_pool.py::test_memory",
     "test_process_pool.py::TestChoice",
     "test_resources.py::test_linux_libraries",

@@ -212,7 +212,7 @@ MUTATIONS: Final = (
         "            self._pool.inputs",
         "            self._pool.inputs",
         "if an action is refused, the environments before it have taken theirs",
-        ("tests/environment/vector/test_vector_per_env.py",),
+        ("tests/environment/vector/test_vector_hooks.py",),
     ),
     Mutation(
         "environment",
