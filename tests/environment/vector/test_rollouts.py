@@ -136,21 +136,6 @@ def test_a_policy_is_not_asked_once_all_have_ended(vector_of):
     assert not found.rewards[:, 12:].any()
 
 
-def test_from_one_root_no_state_is_serialized(monkeypatch, vector_of):
-    """Planning costs one saved state, however many candidates there are."""
-    env, envs = halfway(), vector_of(Track, N)
-    snapshot, saved = env.save_state(), []
-    pool = envs.pool
-    kept = pool.save_states
-    monkeypatch.setattr(pool, "save_states", lambda i, r: saved.append(len(i)) or kept(i, r))
-    envs.rollout(snapshot, actions_for(env, 3 * N))
-    assert not saved
-    envs.reset(seed=0)  # now there are episodes to return to
-    envs.rollout(snapshot, actions_for(env, 3 * N))
-    assert saved == [N]
-    env.close()
-
-
 class TestParameters:
     @in_turn({"way": WAYS, "version": ["2.0", "3.0"]})
     def test_of_each_candidate(self, way, version, vector_of):

@@ -17,7 +17,6 @@ from vector_tools import (
     in_each_mode,
     require_equal,
     results_of_both,
-    sampled_actions,
 )
 from ways import in_way
 
@@ -97,18 +96,6 @@ def test_pictures_show_the_last_step(hooks, pair):
     list(results_of_both(*envs, 1))
     ours.render()
     assert plain(tuple(seen)) == plain(theirs.call("told"))
-
-
-@each_way
-def test_a_recorded_series_tells_the_state_before(hooks, pair):
-    envs = ours, theirs = pair(hooks)
-    actions = sampled_actions(ours, 1)
-    list(results_of_both(*envs, actions))
-    told = ours.episodes.evaluate(
-        lambda env: [env.previous_state[0], env.previous_action[0]], *actions, np.arange(COUNT)
-    )
-    for row, one in zip(told.T, theirs.call("told"), strict=True):
-        assert row.tolist() == [one["previous_state"][0], one["previous_action"][0]]
 
 
 def test_before_the_first_reset(make_envs):
