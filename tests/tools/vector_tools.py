@@ -170,10 +170,6 @@ def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, way="arrays", **kw)
     return ours, theirs
 
 
-def require_pair_equal(cls, steps=60, mode=AutoresetMode.NEXT_STEP, rtol=0.0, **keywords):
-    return run_side_by_side(*make_pair(cls, mode, **keywords), steps, rtol=rtol)
-
-
 def require_same_alone(make, steps, mode="next_step", method=None, way=None, **options):
     """Three environments give what single ones give, to the last bit; returns how many ends.
 
