@@ -588,7 +588,7 @@ VARIABLES = {
     "variables change their types": Case(Changing),
     "a variable is an index": Case(Queueing),
     "variables hold several numbers": Case(
-        Historic, not_restored="on arrays, no variable is restored that was a number at the start"
+        Historic, not_restored="on arrays, a number that becomes an array is not restored"
     ),
     "a target is drawn": Case(Tracking, rtol=ROUNDED),
     "variables hold histories": Case(Delayed, rtol=ROUNDED),
