@@ -93,8 +93,6 @@ SLOW_MODULES = {
     "test_value_types",
     "test_vector_ends",
     "test_vector_masks",
-    "test_vector_per_env_inputs",
-    "test_vector_variables",
     "test_wild_equations",
     "test_without_native",
     "test_zoo",
@@ -126,6 +124,7 @@ WITHOUT_EXTENSION = {
 EVERY = {
     "test_expressions": 5,
     "test_commands": 5,
+    "test_contract": 17,
     "test_golden_tasks": 8,
     "test_hostile_archive": 19,
     "test_pool": 7,
@@ -180,6 +179,7 @@ EVERY_OF_OTHERS_IN_CI = 7
 """For the modules that are not in ``EVERY_IN_CI``; their parameters take turns."""
 
 SLOW_TESTS = (
+    "test_contract.py::test_worker_processes",
     "test_env.py::test_time_is_exact",
     "test_exported_expressions.py::test_an_agent_in_onnx",
     "test_exported_expressions.py::test_curves_in_onnx",
@@ -222,8 +222,7 @@ SLOW_TESTS = (
     "test_isolated_rollouts.py::test_a_rollout",
     "test_isolated_rollouts.py::test_faults",
     "test_isolated_rollouts.py::test_results",
-    "test_isolated_single.py::test_interrupts",
-    "test_isolated_single.py::test_results",
+    "test_isolated_environments.py::test_interrupts",
     "test_native_pool.py::test_memory",
     "test_process_pool.py::TestChoice",
     "test_resources.py::test_linux_libraries",
@@ -249,7 +248,7 @@ SLOW_TESTS = (
     "test_trial.py::TestSurvival::test_a_verdict",
     "test_trial.py::TestSurvival::test_is_remembered",
     "test_trial.py::TestSurvival::test_without_a_place",
-    "test_vector_codec.py::test_gathered_as",
+    "test_vector_infos.py::test_gathered_as",
     "test_other_makers.py::test_vector[pythonfmu",
     "test_other_makers.py::test_who_calls_python",
     "test_other_makers.py::test_single[pythonfmu",
@@ -309,7 +308,6 @@ EXHAUSTIVE_TESTS = (
     "test_slow_models.py::TestTime",
     "test_systems_many.py",
     "test_systems_ssp.py::TestLarge",
-    "test_vector_masks.py::test_episodes",
     "test_quirks.py::test_the_check_finds_bad_resets[3-stops, slow at first",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from combinations import in_turn
+from contract_cases import ActionsInParts
 from fmu_tools import probe_fmu
 from vector_tools import ABSURD, IDS, Cart, Reaching
 
@@ -313,3 +314,9 @@ class TestTolerance:
         env = make_env(version)
         env.reset()
         assert env.read_variables("tolerance")["tolerance"] == -1.0
+
+
+def test_before_the_first_action_in_parts_are_zeros():
+    with ActionsInParts() as env:
+        env.reset(seed=1)
+        assert env.step(env.action_space.sample())[1] == 0.0

@@ -199,19 +199,6 @@ class TestSingle:
 
 
 class TestVector:
-    def test_ended_episodes_stay_ended(self, make_envs):
-        envs = make_envs(Track, 2, max_episode_steps=2)
-        envs.reset(seed=0)
-        actions = np.zeros((2, 1), np.float32)
-        envs.step(actions)
-        envs.step(actions)
-        snapshot = envs.save_state()
-        expected = envs.step(actions)
-        envs.restore_state(snapshot)
-        again = envs.step(actions)
-        assert again[0].tolist() == expected[0].tolist()
-        assert again[1].tolist() == [0.0, 0.0]
-
     @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_parameters_from_options_are_restored(self, hooks, vector_of):
         envs = vector_of(in_way(hooks, Track), 2)

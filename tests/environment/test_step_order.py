@@ -1,11 +1,8 @@
 """Every way of calling hooks follows the one order of a step."""
 
-import gymnasium as gym
 import numpy as np
 from vector_tools import Drawing
 from ways import in_way
-
-import fmugym
 
 ORDER = (
     *("_get_inputs", "_update", "_is_done", "_is_truncated", "_reward_policy"),
@@ -84,23 +81,3 @@ def test_one_environment_at_a_time(make_envs):
     step = [ORDER[0]] * 3 + [*ORDER[1:]] * 3
     assert called == [*step, *step]
     assert values == EXPECTED
-
-
-class Plain(Recording):
-    """What can be compiled."""
-
-    _update = fmugym.FMUEnv._update
-    _get_info = fmugym.FMUEnv._get_info
-    _get_observation = fmugym.FMUEnv._get_observation
-
-    def __init__(self):
-        Drawing.__init__(self)
-
-    def _get_action_space(self):
-        return gym.spaces.Discrete(2)
-
-    def _is_done(self):
-        return self._note("_is_done", self.step_count >= 2)
-
-    def _reward_policy(self):
-        return self._note("_reward_policy", np.where(self.done, -1.0, 1.0 * self.step_count))

@@ -14,8 +14,6 @@ import fmugym
 from fmugym import Uniform
 from fmugym.control.linearization import linearize_along
 from fmugym.environment.vector import FMUVectorEnv
-from fmugym.environment.vector.array_episodes import ArrayEpisodes
-from fmugym.environment.vector.infos import observation_of
 
 IDS = (
     "fmugym/CartPole-v0",
@@ -37,7 +35,12 @@ def in_each_mode(axes, hooks=HOOKS):
 
 
 def require_equal(first, second, rtol=0.0):
-    """Same types, shapes and values; dicts and arrays of objects element by element."""
+    """Same types, shapes and values; dicts, tuples and arrays of objects element by element."""
+    if isinstance(first, tuple):
+        assert len(first) == len(second)
+        for one, other in zip(first, second, strict=True):
+            require_equal(one, other, rtol)
+        return
     if isinstance(first, Mapping):
         assert first.keys() == second.keys()
         for key in first:
@@ -45,8 +48,8 @@ def require_equal(first, second, rtol=0.0):
         return
     first, second = np.asarray(first), np.asarray(second)
     assert (first.dtype, first.shape) == (second.dtype, second.shape)
-    if rtol:
-        np.testing.assert_allclose(first, second, rtol=rtol, atol=0)
+    if rtol and first.dtype.kind == "f":
+        np.testing.assert_allclose(first, second, rtol=rtol, atol=rtol)
     else:
         np.testing.assert_array_equal(first, second)
 
@@ -74,7 +77,18 @@ def methods(envs, snapshot):
     }
 
 
-def require_same_infos(first, second):
+def of_one(value, index):
+    """The part of results that belongs to one of many environments."""
+    if isinstance(value, Mapping):
+        masks = {name: value.get(f"_{name}") for name in value if not name.startswith("_")}
+        told = (name for name, mask in masks.items() if mask is None or mask[index])
+        return {name: of_one(value[name], index) for name in told}
+    if isinstance(value, tuple):
+        return tuple(of_one(part, index) for part in value)
+    return value[index]
+
+
+def require_same_infos(first, second, rtol=0.0):
     """What counts of an entry is only what its mask says."""
     assert first.keys() == second.keys()
     for key in first:
@@ -84,14 +98,14 @@ def require_same_infos(first, second):
         assert mask.dtype == second[f"_{key}"].dtype == np.bool_
         assert mask.tolist() == second[f"_{key}"].tolist(), key
         if isinstance(first[key], Mapping) and isinstance(second[key], Mapping):
-            require_same_infos(first[key], second[key])
+            require_same_infos(first[key], second[key], rtol)
             continue
         if isinstance(first[key], Mapping):  # the last observations, which Gymnasium has as objects
             for index in np.flatnonzero(mask):
-                require_equal(observation_of(first[key], index), second[key][index])
+                require_equal(of_one(first[key], index), second[key][index], rtol)
             continue
         for left, right in zip(first[key][mask], second[key][mask], strict=True):
-            require_equal(left, right)
+            require_equal(left, right, rtol)
 
 
 def sampled_actions(env, count, seed=0):
@@ -154,10 +168,6 @@ def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, way="arrays", **kw)
     ours = FMUVectorEnv(in_way(way, lambda: cls(**kw)), num_envs, autoreset_mode=mode)
     theirs = SyncVectorEnv([lambda: cls(**kw)] * num_envs, autoreset_mode=mode)
     return ours, theirs
-
-
-def require_pair_equal(cls, steps=60, mode=AutoresetMode.NEXT_STEP, rtol=0.0, **keywords):
-    return run_side_by_side(*make_pair(cls, mode, **keywords), steps, rtol=rtol)
 
 
 def require_same_alone(make, steps, mode="next_step", method=None, way=None, **options):
@@ -356,20 +366,6 @@ class Shifted(Drawing):
 
     def _get_info(self):
         return {"action": self.action, "before": self.previous_action}
-
-
-@pytest.fixture(name="outside")
-def fixture_outside(monkeypatch):
-    """The episodes that Python has started, and not the pass of the native pool."""
-    calls = []
-    begin = ArrayEpisodes.begin
-
-    def counted(self, *args):
-        calls.append(args)
-        return begin(self, *args)
-
-    monkeypatch.setattr(ArrayEpisodes, "begin", counted)
-    return calls
 
 
 # What callers may do to an array of results in place.

@@ -3,11 +3,13 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract_cases import writing
 from vector_tools import Drawing, Historic, Reaching, Remembering, Shifted
 
 import fmugym
 from fmugym import ConfigError, ContractError, Uniform
 from fmugym.environment.env_checker import check_hooks
+from fmugym.environment.hooks import ORDER
 
 
 def wide(*shape):
@@ -341,3 +343,9 @@ def test_other_environments_are_refused():
 
 def test_arguments_go_to_the_class():
     check_hooks(fmugym.envs.PendulumEnv, g=9.81)
+
+
+@pytest.mark.parametrize("hook", [one for one in ORDER if one not in ("_get_inputs", "_update")])
+def test_no_other_hook_than_update_may_write_variables(hook):
+    with pytest.raises(ContractError, match=f"{hook} changes self.variables"):
+        check_hooks(writing(hook))

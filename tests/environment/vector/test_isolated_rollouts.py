@@ -4,9 +4,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from contract_cases import PENDULUM
 from example_tools import EXAMPLES
 from process_tools import faulty_fmu, start_values
-from test_single_expressions import PENDULUM
 from vector_tools import require_equal
 from ways import in_way
 

@@ -1,6 +1,5 @@
 """Rollouts: what candidates would lead to equals what single environments do from a snapshot."""
 
-import gymnasium
 import numpy as np
 import pytest
 from combinations import in_turn
@@ -102,25 +101,6 @@ class TestValues:
         observations, *_ = envs.step(actions[:, 0])
         assert observations.tolist() == found.observations[:, 0].tolist()
 
-    def test_of_observations_that_are_dicts(self, vector_of):
-        class Named(Track):
-            def _get_observation_space(self):
-                box = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-                return gymnasium.spaces.Dict({"q": box, "u": box})
-
-            def _get_observation(self):
-                return {"q": np.stack([self.out["q"]]), "u": np.stack([self.inputs[0]])}
-
-        env = halfway(Named)
-        actions, snapshot = actions_for(env), env.save_state()
-        results = []
-        for hooks in ("arrays", "one by one"):
-            envs = vector_of(in_way(hooks, Named), 3)
-            found = envs.rollout(snapshot, actions)
-            results.append([found.observations[name].tolist() for name in ("q", "u")])
-            assert found.observations["q"].shape == (N, HORIZON, 1)
-        assert results[0] == results[1]
-
     @pytest.mark.parametrize("hooks", ["arrays", "one by one"])
     def test_of_a_policy(self, hooks, vector_of):
         def policy(observations):
@@ -154,21 +134,6 @@ def test_a_policy_is_not_asked_once_all_have_ended(vector_of):
     assert asked == [N] * 12
     assert (found.observations[:, 12:] == found.observations[:, 11:12]).all()
     assert not found.rewards[:, 12:].any()
-
-
-def test_from_one_root_no_state_is_serialized(monkeypatch, vector_of):
-    """Planning costs one saved state, however many candidates there are."""
-    env, envs = halfway(), vector_of(Track, N)
-    snapshot, saved = env.save_state(), []
-    pool = envs.pool
-    kept = pool.save_states
-    monkeypatch.setattr(pool, "save_states", lambda i, r: saved.append(len(i)) or kept(i, r))
-    envs.rollout(snapshot, actions_for(env, 3 * N))
-    assert not saved
-    envs.reset(seed=0)  # now there are episodes to return to
-    envs.rollout(snapshot, actions_for(env, 3 * N))
-    assert saved == [N]
-    env.close()
 
 
 class TestParameters:

@@ -5,43 +5,17 @@ import logging
 import gymnasium as gym
 import numpy as np
 import pytest
+from contract_cases import PENDULUM
 from example_tools import EXAMPLES
 from fmu_tools import PlainEnv, probe_config
 from vector_tools import Drawing
 from ways import in_python
 
-import fmugym
 from fmugym import ConfigError, SimulationError
 from fmugym.environment.episode import READABLE
 from fmugym.task.task_env import TaskEnv
 
 READ = (*READABLE, "time")
-
-UNIFORM = {"distribution": "uniform", "low": -1.0, "high": 1.0}
-PENDULUM = {
-    "fmu": str(fmugym.bundled_fmu("Pendulum")),
-    "time_step": 0.02,
-    "episode_length": 0.3,
-    "variables": {"tau": {"min": -0.01, "max": 0.01}},
-    "parameters": {"q_0": UNIFORM},
-    "memory": {
-        "target": {"start": UNIFORM},
-        "count": {"start": 0, "update": "count + 1"},
-        "total": {"start": 0.5, "update": "total / 2 + q"},
-    },
-    "terminated": "q > target and count > 5",
-    "reward": "-abs(q - target) - 0.1 * total",
-    "costs": {"effort": "abs(tau)"},
-    "agent": {"actions": ["tau"], "observations": ["q", "q_dot", "total"]},
-}
-"""Everything that an expression may read and write."""
-
-TASKS = {
-    "cart-pole": EXAMPLES / "cart_pole.toml",
-    "pendulum": EXAMPLES / "pendulum.toml",
-    "memory and ends": PENDULUM,
-}
-each_task = pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 
 
 def same(first, second):
@@ -73,25 +47,6 @@ def require_same_steps(one, other, *actions):
         require_readings(one, other)
 
 
-def require_same(one, other, steps=120):
-    """Play episodes side by side; return how many have ended."""
-    ended = 0
-    assert same(one.reset(seed=5), other.reset(seed=5))
-    one.action_space.seed(1)
-    for index in range(steps):
-        action = one.action_space.sample()
-        first, second = one.step(action), other.step(action)
-        assert same(first, second), (index, first, second)
-        if index % 5 == 0:
-            require_readings(one, other)
-        if first[2] or first[3]:
-            require_readings(one, other)
-            ended += 1
-            assert same(one.reset(), other.reset())
-            require_readings(one, other)
-    return ended
-
-
 @pytest.fixture
 def both(load):
     """Make an environment that is compiled, and one in Python, after a reset."""
@@ -104,29 +59,6 @@ def both(load):
         return envs
 
     return make
-
-
-@each_task
-def test_results_and_readings_are_those_of_python(task, both):
-    assert require_same(*both(task), steps=600) > 1
-
-
-@each_task
-def test_it_is_a_batch_of_one(task, load, make_envs):
-    """To the last bit."""
-    one, many = load(task), make_envs(lambda: fmugym.load(task), 1)
-    one.reset(seed=5)
-    many.reset(seed=5)
-    many.action_space.seed(1)
-    for _ in range(60):
-        actions = many.action_space.sample()
-        observations, rewards, terminated, truncated, _ = many.step(actions)
-        result = one.step(actions[0])
-        assert result[0].tobytes() == observations[0].tobytes()
-        assert result[1:4] == (rewards[0], terminated[0], truncated[0])
-        if terminated[0] or truncated[0]:
-            one.reset()
-            many.step(actions)  # which begins the next episode
 
 
 def test_overridden_parameters(both):

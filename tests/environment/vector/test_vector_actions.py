@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from combinations import in_turn
+from fmu_tools import PlainEnv, probe_config
 from vector_tools import (
     CART_POLE,
     HOOKS,
@@ -105,3 +106,18 @@ def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks, dtype, make_envs):
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1"):
         vector.step(np.array([[0.0], [np.nan]], dtype))
+
+
+def test_inputs_outside_of_their_type(probe, make_envs):
+    class Typed(PlainEnv):
+        def __init__(self):
+            names = {"model_input_names": "n", "model_output_names": ["n_out", "steps"]}
+            super().__init__(probe(), probe_config(**names))
+
+        def _get_inputs(self):
+            return np.where(self.action > 2, 3e9, 1.0)
+
+    envs = make_envs(in_way("arrays", Typed), 2)
+    envs.reset(seed=0)
+    with pytest.raises(ConfigError, match="expected an integer from"):
+        envs.step(np.array([1, 5]))

@@ -2,16 +2,19 @@
 
 import numpy as np
 import pytest
+from contract_cases import Summing, WithCost
 from gymnasium.vector import SyncVectorEnv
 from vector_tools import (
     CART_POLE,
     Drawing,
     each_way,
     require_equal,
+    require_same_starts,
     results_of_both,
     run_side_by_side,
+    sampled_actions,
 )
-from ways import in_way
+from ways import WAYS, in_way
 
 from fmugym import ConfigError, Uniform
 from fmugym.environment.vector import FMUVectorEnv
@@ -210,3 +213,82 @@ def test_what_the_environments_keep_themselves_cannot_be_set(hooks, make_envs):
     for name in ("state", "time", "action_space", "interface", "step", "_is_done", "fmu"):
         with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
             vector.set_attr(name, 1.0)
+
+
+class Adding(Summing):
+    """Assigns new arrays."""
+
+    def _update(self):
+        self.variables["sum"] = self.variables["sum"] + self.state[0]
+
+
+def test_sums_go_on_while_an_episode_has_parameters_of_its_own(make_envs):
+    ours, theirs = (
+        make_envs(in_way(hooks, lambda: Adding(max_episode_steps=50)), 3, autoreset_mode="Disabled")
+        for hooks in ("arrays", "one by one")
+    )
+    first = np.array([True, False, False])
+    overriding = {"reset_mask": first, "model_parameters": {"m": 0.06}}
+    for options in ({}, overriding, {"reset_mask": first}):
+        for envs in ours, theirs:
+            envs.reset(seed=1 if not options else None, options=options)
+        for actions in sampled_actions(ours, 4):
+            for mine, other in zip(ours.step(actions)[:4], theirs.step(actions)[:4], strict=True):
+                require_equal(mine, other)
+
+
+@each_way
+def test_methods_that_were_read_before_read_the_present_values(hooks, make_envs):
+    vector = make_envs(in_way(hooks, WithCost), 3)
+    vector.reset(seed=2)
+    methods = vector.get_attr("_reward_policy")
+    vector.step(np.zeros((3, 1), np.float32))
+    expected = [-state[0] * state[0] for state in vector.get_attr("state")]
+    assert [method() for method in methods] == expected
+    assert list(vector.call("cost")) == [-value for value in expected]
+
+
+CHANGES = {
+    "options": lambda vector: vector.reset(
+        options={
+            "model_parameters": {"m_pole": 0.3},
+            "reset_mask": np.array([True, False, False]),
+        }
+    ),
+    "parameters": lambda vector: vector.set_attr("m_pole", [0.05, 0.2, 0.3]),
+    "another parameter": lambda vector: vector.set_attr("theta_dot_0", [0.01, 0.02, 0.03]),
+    "an attribute": lambda vector: vector.set_attr("x_threshold", 0.05),
+}
+
+
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_change_is_that_of_single_environments(change, mode, make_envs):
+    """In the episodes that it meets, and in those after them."""
+    ours, theirs = (
+        make_envs(in_way(hooks, CART_POLE), 3, max_episode_steps=12, autoreset_mode=mode)
+        for hooks in WAYS
+    )
+    for count, _ in enumerate(results_of_both(ours, theirs, 60)):
+        if count == 6:
+            first, second = CHANGES[change](ours), CHANGES[change](theirs)
+            if first is not None:
+                require_same_starts(first, second)
+    assert count == 59
+
+
+class Weighing(Drawing):
+    """The reward is for a parameter that only some options give."""
+
+    def _reward_policy(self):
+        return self.parameters.get("b", -1.0) + 0.0 * self.state[0]
+
+
+def test_hooks_read_parameters_that_options_add():
+    ways = [FMUVectorEnv(in_way(way, Weighing), 3) for way in WAYS]
+    for envs in ways:
+        envs.reset(seed=1)
+        assert envs.step(envs.action_space.sample())[1].tolist() == [-1.0] * 3
+        envs.reset(options={"model_parameters": {"b": 0.25}})
+        assert envs.step(envs.action_space.sample())[1].tolist() == [0.25] * 3
+        envs.close()

@@ -15,12 +15,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from combinations import in_turn
+from contract_cases import OUTPUTS, PENDULUM, Nested, Pair, Square
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
-from test_single_expressions import PENDULUM
 from vector_tools import (
     CART_POLE,
-    Drawing,
     require_equal,
     sampled_actions,
 )
@@ -40,54 +39,6 @@ NUM_ENVS, STEPS = 6, 60
 BOX = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
 
-class Shaped(Drawing):
-    """Observations of a form of their own; the number of steps differs between environments."""
-
-    def __init__(self):
-        super().__init__(max_episode_steps=5)
-
-    def _is_done(self):
-        return self.state[0] > 0.5
-
-    def _array(self):
-        return np.array([self.state[0], self.state[1]], np.float32)
-
-
-class Square(Shaped):
-    """An array with two axes."""
-
-    def _get_observation_space(self):
-        return gym.spaces.Box(-np.inf, np.inf, (2, 2), np.float64)
-
-    def _get_observation(self):
-        return np.array([[self.state[0], self.state[1]], [self.previous_state[0], self.time]])
-
-
-class Telling(Shaped):
-    """Dicts in dicts, and infos."""
-
-    def _get_observation_space(self):
-        inner = gym.spaces.Dict({"state": BOX, "time": gym.spaces.Box(0, 99, (1,))})
-        return gym.spaces.Dict({"plant": inner, "steps": gym.spaces.Box(0, 99, (1,), np.int64)})
-
-    def _get_observation(self):
-        plant = {"state": self._array(), "time": np.array([self.time], np.float32)}
-        return {"plant": plant, "steps": np.array([self.step_count])}
-
-    def _get_info(self):
-        return {"angle": self.state[0], "nested": {"speed": self.state[1]}}
-
-
-class Pair(Shaped):
-    """What makes no array: a tuple."""
-
-    def _get_observation_space(self):
-        return gym.spaces.Tuple([BOX, gym.spaces.Discrete(2)])
-
-    def _get_observation(self):
-        return self._array(), np.int64(self.state[0] > 0.2)
-
-
 def of_expressions():
     """A task whose programs store observations and infos."""
     return fmugym.load(PENDULUM)
@@ -95,11 +46,10 @@ def of_expressions():
 
 def of_outputs():
     """A task whose observations the pool itself makes."""
-    return fmugym.load({**PENDULUM, "costs": {}, "agent": OUTPUTS})
+    return fmugym.load(PENDULUM | OUTPUTS)
 
 
-OUTPUTS = {"actions": ["tau"], "observations": ["q", "q_dot"]}
-TASKS = [CART_POLE, Square, Telling, of_expressions, of_outputs]
+TASKS = [CART_POLE, Square, Nested, of_expressions, of_outputs]
 COMPILED = [of_expressions, of_outputs]
 
 

@@ -1,54 +1,25 @@
 """Infos and results of vector environments belong to the caller."""
 
-import pickle
 from collections.abc import Mapping
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from vector_tools import (
     CART_POLE,
     Remembering,
     each_way,
     in_each_mode,
-    require_equal,
+    require_same_infos,
     sampled_actions,
 )
-from ways import in_way, make_vec, many
+from ways import in_way, make_vec
 
-import fmugym
-
-
-def arrays_of(value):
-    if isinstance(value, Mapping):
-        return [array for inner in value.values() for array in arrays_of(inner)]
-    return [value] if isinstance(value, np.ndarray) else []
-
-
-@each_way
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_results_belong_to_the_caller(mode, hooks):
-    """Spoiling results changes nothing, and later steps do not change results."""
-    keywords = {"autoreset_mode": mode, "way": hooks}
-    for cls in (Remembering, fmugym.envs.CartPoleEnv):
-        careful, careless = (many(cls, 3, **keywords) for _ in range(2))
-        kept = [careful.reset(seed=0)]
-        careless.reset(seed=0)
-        copies = [pickle.dumps(kept[0])]
-        for actions in sampled_actions(careful, 40):
-            kept.append(careful.step(actions))
-            copies.append(pickle.dumps(kept[-1]))
-            given = actions.copy()
-            result = careless.step(given)
-            require_equal(result[0], kept[-1][0])
-            require_equal(np.array(result[1:4]), np.array(kept[-1][1:4]))
-            for array in [a for part in result for a in arrays_of(part)]:
-                array[...] = None if array.dtype == object else 1
-            given[...] = 0
-        assert [pickle.dumps(result) for result in kept] == copies
-        careful.close()
-        careless.close()
+from fmugym import ConfigError
+from fmugym.environment.vector.infos import gathered, handed_out
 
 
 @each_way
@@ -97,16 +68,70 @@ def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks, make_envs):
     assert told > 0
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_infos_that_are_first_read_after_later_steps(mode, make_envs):
-    """The arrays of drawn values and of last observations serve only until an episode starts."""
-    at_once, later = (make_envs(fmugym.envs.CartPoleEnv, 6, autoreset_mode=mode) for _ in range(2))
-    at_once.reset(seed=5)
-    later.reset(seed=5)
-    read, kept = [], []
-    for actions in sampled_actions(at_once, 60):
-        read.append(pickle.dumps(dict(at_once.step(actions)[4])))
-        kept.append(later.step(actions)[4])
-    assert sum("drawn" in infos for infos in kept) > 5
-    for one, other in zip(read, kept, strict=True):
-        assert pickle.dumps(dict(other)) == one
+COUNT = 4
+KINDS = {
+    "integer": st.integers(-100, 100),
+    "number": st.floats(-1e6, 1e6),
+    "flag": st.booleans(),
+    "single": st.floats(-100.0, 100.0, width=32).map(np.float32),
+    "numpy flag": st.booleans().map(np.bool_),
+    "text": st.text(max_size=3),
+    "array": st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=2).map(np.array),
+}
+FLAT = st.fixed_dictionaries({}, optional=KINDS)
+NESTED = st.fixed_dictionaries({}, optional=KINDS | {"inner": FLAT})
+INFOS = st.dictionaries(st.integers(0, COUNT - 1), NESTED)
+
+
+class Telling(gym.Env):
+    """Has nothing but an info."""
+
+    observation_space = action_space = gym.spaces.Discrete(1)
+
+    def reset(self, *, seed=None, options=None):
+        return 0, self.info
+
+
+def by_gymnasium(infos):
+    envs = gym.vector.SyncVectorEnv([Telling] * COUNT)
+    for index, env in enumerate(envs.envs):
+        env.info = infos.get(index, {})
+    return envs.reset()[1]
+
+
+@settings(max_examples=70, deadline=None)
+@given(INFOS)
+def test_gathered_as_gymnasium_does(infos):
+    ours, theirs = gathered(dict(sorted(infos.items())), COUNT), by_gymnasium(infos)
+    assert list(ours) == list(theirs)
+    require_same_infos(ours, theirs)
+
+
+@settings(max_examples=70, deadline=None)
+@given(INFOS)
+def test_handed_out_again(infos):
+    into = [{} for _ in range(COUNT)]
+    handed_out(gathered(infos, COUNT), into)
+    for index, info in enumerate(into):
+        expected = infos.get(index, {})
+        assert info.keys() == expected.keys()
+        for name, value in info.items():
+            require_equal_parts(value, expected[name])
+
+
+def require_equal_parts(value, expected):
+    if isinstance(expected, dict):
+        assert value.keys() == expected.keys()
+        for name in expected:
+            require_equal_parts(value[name], expected[name])
+    else:
+        np.testing.assert_array_equal(value, expected)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [(1.0, "a"), (np.zeros(2), np.zeros(3)), ({"a": 1}, 2), (1.0, {"a": 1}), (np.zeros(2), "x")],
+)
+def test_values_that_do_not_fit_are_named(first, second):
+    with pytest.raises(ConfigError, match=r"environment 3: its info does not fit .*'odd' is"):
+        gathered({1: {"odd": first}, 3: {"odd": second}}, COUNT)

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 from combinations import in_turn
-from vector_tools import HOOKS, Drawing, require_equal, require_pair_equal
+from vector_tools import Drawing, require_equal
 from ways import in_way, make_vec
 
 import fmugym
@@ -58,51 +58,6 @@ def test_they_may_differ_in_values(make_envs):
     )
     observations, _ = vector.reset(seed=1)
     np.testing.assert_allclose(observations[:, 0], [0.1, 0.2, 0.3], rtol=1e-6)
-
-
-class WithHelper(Drawing):
-    """Its constructor makes and uses other environments, before and after its own."""
-
-    def __init__(self):
-        self.before = self.first_angle()
-        super().__init__()
-        self.helper = Drawing()
-        self.after = self.first_angle()
-        self.many = FMUVectorEnv(Drawing, 2)
-        self.several = self.many.reset(seed=5)[0][:, 0].tolist()
-
-    def first_angle(self):
-        helper = Drawing()
-        helper.reset(seed=5)
-        angle = helper.state[0]
-        helper.close()
-        return angle
-
-    def _reward_policy(self):
-        return self.state[0] + self.before - self.after + self.several[0]
-
-    def close(self):
-        super().close()
-        if hasattr(self, "many"):
-            self.helper.close()
-            self.many.close()
-
-
-class UsesItself(Drawing):
-    """Its constructor plays an episode."""
-
-    def __init__(self):
-        super().__init__()
-        self.reset(seed=5)
-        self.offset = self.state[0]
-
-    def _reward_policy(self):
-        return self.state[0] - self.offset
-
-
-@in_turn({"hooks": HOOKS, "cls": [WithHelper, UsesItself]})
-def test_constructors_may_make_and_use_environments(cls, hooks):
-    require_pair_equal(cls, 12, num_envs=3, way=hooks)
 
 
 @pytest.mark.parametrize("hooks", ["arrays", "one by one"])

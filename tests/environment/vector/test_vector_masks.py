@@ -9,71 +9,12 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from combinations import in_turn
+from contract_cases import Nested, Pictured
 from gymnasium.vector import AutoresetMode
-from vector_tools import CART_POLE, Drawing, PushedCart, require_equal, require_pair_equal
+from vector_tools import CART_POLE, Drawing, require_equal
 from ways import in_way
 
 from fmugym import SimulationError, Uniform
-from fmugym.environment.vector.expression_task import Expressions
-
-
-class Pictured(Drawing):
-    """The observation is a small picture."""
-
-    def _get_observation_space(self):
-        return gym.spaces.Box(0, 255, (2, 3), np.uint8)
-
-    def _get_observation(self):
-        angle = np.clip(self.state[0] * 100 + 100, 0, 255)
-        steps, one = self.step_count, np.ones_like(angle)
-        return np.array([[angle, one, one], [steps, one, angle / 2]]).astype(np.uint8)
-
-
-class Nested(Drawing):
-    """A dict within a dict, and infos."""
-
-    def _get_observation_space(self):
-        box = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-        return gym.spaces.Dict({"own": gym.spaces.Dict({"state": box}), "twice": box})
-
-    def _get_observation(self):
-        state = np.array([self.state[0], self.state[1]], np.float32)
-        return {"own": {"state": state}, "twice": 2 * state}
-
-    def _get_info(self):
-        return {"angle": self.state[0], "of": {"steps": self.step_count}}
-
-
-class Summing(Drawing):
-    """Reads episode variables, some of them drawn, actions and the state before the step."""
-
-    def __init__(self):
-        variables = {"target": Uniform(-1.0, 1.0), "sum": 0.0, "steps": 0}
-        super().__init__(episode_variables=variables, monitor_names=["theta_ddot"])
-
-    def _update(self):
-        error = self.variables["target"] - self.state[0]
-        self.variables["sum"] = self.variables["sum"] + error
-        self.variables["steps"] = self.variables["steps"] + 1
-
-    def _get_observation_space(self):
-        return gym.spaces.Box(-np.inf, np.inf, (5,), np.float64)
-
-    def _get_observation(self):
-        moved = self.state[0] - self.previous_state[0]
-        own = self.variables["target"], self.variables["sum"], self.variables["steps"]
-        return np.array([*own, moved, self.action[0] - self.previous_action[0]])
-
-
-class Failing(PushedCart):
-    """Some episodes end by a fault."""
-
-    def __init__(self):
-        super().__init__(max_episode_steps=3, on_fault="terminate", fault_reward=-7.0)
-
-
-TASKS = [CART_POLE, Drawing, Summing, Pictured, Nested, Failing]
 
 
 @pytest.fixture
@@ -103,28 +44,6 @@ def require_same(first, second):
 def masks(rng, ended):
     """The environments that have ended, and some others now and then."""
     return ended | (rng.random(len(ended)) < 0.2)
-
-
-@in_turn({"task": TASKS, "num_envs": [1, 5, 140]})
-def test_episodes_are_those_of_single_environments(task, num_envs):
-    """Whose ends are reset by masks."""
-    options = {
-        "num_envs": num_envs,
-    }
-    assert require_pair_equal(task, 120, AutoresetMode.DISABLED, **options) > 3
-
-
-@pytest.mark.parametrize("task", [CART_POLE, Drawing, Summing, Pictured, Nested])
-def test_one_call_of_the_pool_does_it(task, monkeypatch, made):
-    envs = made(task)
-
-    def refuse(*_):
-        raise AssertionError("the general way")
-
-    monkeypatch.setattr(Expressions, "reset", refuse)
-    for mask in np.eye(5, dtype=np.bool_):
-        envs.reset(options={"reset_mask": mask})
-    monkeypatch.undo()
 
 
 @pytest.mark.parametrize("task", [CART_POLE, Pictured, Nested])

@@ -5,19 +5,24 @@ no use for them, but the caller may ask for them at any time. The reference are 
 in Python.
 """
 
-from itertools import islice
-
 import numpy as np
 import pytest
+from contract_cases import WITH_DONE
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
+    HOOKS,
     Drawing,
+    each_mode,
     each_way,
     in_each_mode,
+    require_equal,
     results_of_both,
-    sampled_actions,
 )
 from ways import in_way
+
+import fmugym
+from fmugym.environment.vector import FMUVectorEnv
+from fmugym.records import RecordVectorSeries
 
 COUNT, STEPS = 3, 6
 NAMES = (
@@ -72,16 +77,6 @@ def test_the_last_step_is_told_from_the_first_question_on(first, way, hooks, mod
             assert plain(ASKED[way](ours)) == plain(theirs.call("told")), count
 
 
-@in_each_mode({"count": [1, 2, 3]})
-def test_snapshots_hold_the_last_step(count, hooks, mode, pair):
-    envs = ours, theirs = pair(hooks, mode)
-    list(islice(results_of_both(*envs, STEPS, seed=0), count))
-    for index, told in enumerate(theirs.call("told")):
-        with Told() as other:
-            other.restore_state(ours.save_state(index))
-            assert plain(other.told()) == plain(told)
-
-
 @each_way
 def test_pictures_show_the_last_step(hooks, pair):
     """The caption of this environment tells the action and the state before."""
@@ -103,20 +98,27 @@ def test_pictures_show_the_last_step(hooks, pair):
     assert plain(tuple(seen)) == plain(theirs.call("told"))
 
 
-@each_way
-def test_a_recorded_series_tells_the_state_before(hooks, pair):
-    envs = ours, theirs = pair(hooks)
-    actions = sampled_actions(ours, 1)
-    list(results_of_both(*envs, actions))
-    told = ours.episodes.evaluate(
-        lambda env: [env.previous_state[0], env.previous_action[0]], *actions, np.arange(COUNT)
-    )
-    for row, one in zip(told.T, theirs.call("told"), strict=True):
-        assert row.tolist() == [one["previous_state"][0], one["previous_action"][0]]
-
-
 def test_before_the_first_reset(make_envs):
     """There is no last step: the values are those of a new environment."""
     envs = make_envs(Told, 2, way="arrays")
     assert plain(envs.get_attr("step_count")) == [0, 0]
     assert plain(envs.get_attr("previous_action")) == [[0.0], [0.0]]
+
+
+@each_mode
+def test_costs_in_a_series_have_the_done_of_their_step(mode):
+    """They come from the infos; where ``done`` is a cost, it is what the row says of the end."""
+    ours, theirs = (
+        RecordVectorSeries(
+            FMUVectorEnv(in_way(way, lambda: fmugym.load(WITH_DONE)), 3, autoreset_mode=mode)
+        )
+        for way in HOOKS
+    )
+    list(results_of_both(ours, theirs))
+    rows = [{c.name: envs.series[c.name] for c in envs.series.columns} for envs in (ours, theirs)]
+    require_equal(*rows)
+    is_step = rows[0]["step"] > 0
+    assert rows[0]["costs.last"].any()
+    np.testing.assert_array_equal(rows[0]["costs.last"][is_step], rows[0]["terminated"][is_step])
+    ours.close()
+    theirs.close()

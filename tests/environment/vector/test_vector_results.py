@@ -143,22 +143,6 @@ def test_weak_references_end(task, mode):
     assert [reference() for reference in references] == [None] * len(references)
 
 
-class Deep(Drawing):
-    """The observation has eight dimensions."""
-
-    def _get_observation_space(self):
-        return gym.spaces.Box(-np.inf, np.inf, (1,) * 7 + (2,), np.float32)
-
-    def _get_observation(self):
-        return np.array([[[[[[[[self.state[0], self.state[1]]]]]]]]], np.float32)
-
-
-def test_arrays_may_have_many_dimensions():
-    for deep, flat in zip(played(Deep), played(Named), strict=True):
-        assert deep[0].shape == (NUM_ENVS, *(1,) * 7, 2)
-        np.testing.assert_array_equal(deep[0].reshape(NUM_ENVS, 2), flat[0])
-
-
 SEEN, REAL, FLAGS = np.empty((3, 4), np.float32), np.empty(3), np.empty(3, bool)
 DRAWN = np.empty((4, 3))
 ARRAYS = SEEN, REAL, FLAGS, FLAGS, FLAGS, DRAWN

@@ -2,16 +2,12 @@
 
 import numpy as np
 import pytest
-from combinations import in_turn
-from gymnasium.vector import AutoresetMode
+from contract_cases import Targets
 from vector_tools import (
-    HOOKS,
     Drawing,
-    each_mode,
     each_way,
     make_pair,
     require_equal,
-    require_pair_equal,
     require_same_infos,
     require_same_starts,
     results_of_both,
@@ -76,61 +72,6 @@ def test_an_unseeded_reset_draws_from_somewhere(hooks):
 
 
 # Arrays with a distribution for each element
-
-
-class OwnUniform(Uniform):
-    """Only Python can draw from it."""
-
-
-ELEMENTS = {
-    "target": [Uniform(-1, 1), Uniform(0, 2), 0.5],
-    "gain": Uniform(3.0, 4.0),
-    "offset": 1.5,
-    "grid": [
-        [1.0, Choice([1, 2, 3])],
-        [Normal(0.0, 1.0), {"distribution": "uniform", "low": 0, "high": 1}],
-    ],
-    "old": [0.0, 0.0],
-}
-
-
-class Targets(Drawing):
-    """Reads arrays of which some elements are drawn, and writes one of them."""
-
-    def __init__(self, variables=ELEMENTS, **changes):
-        super().__init__(episode_variables=variables, **changes)
-
-    def _update(self):
-        self.variables["grid"] = 0.5 * self.variables["grid"]
-        self.variables["old"] = np.array([self.state[0], self.variables["old"][0]])
-
-    def _reward_policy(self):
-        target, grid = self.variables["target"], self.variables["grid"]
-        return target[0] * self.state[0] + target[1] - grid[1, 0] + grid[0, 1] * target[2]
-
-    def _get_info(self):
-        return {"grid": self.variables["grid"], "gain": self.variables["gain"]}
-
-
-@each_mode
-@each_way
-def test_a_distribution_for_each_element(hooks, mode):
-    """Drawn, reset, told and seen as in single environments, whatever way hooks are called."""
-    way = hooks
-    ours, theirs = make_pair(Targets, mode, num_envs=5, way=way)
-    for _ in results_of_both(ours, theirs, 20):
-        variables = zip(ours.get_attr("variables"), theirs.get_attr("variables"), strict=True)
-        for first, second in variables:
-            require_equal(dict(first), dict(second))
-    ours.close()
-    theirs.close()
-
-
-@in_turn({"mode": list(AutoresetMode), "hooks": HOOKS})
-def test_elements_that_only_python_can_draw(hooks, mode):
-    variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
-    options = {"num_envs": 3, "way": hooks, "variables": variables}
-    assert require_pair_equal(Targets, 12, mode, **options) >= 6
 
 
 def test_elements_are_drawn_in_the_documented_order():

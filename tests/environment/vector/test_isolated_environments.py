@@ -1,22 +1,23 @@
-"""Hooks of environments whose FMUs run in worker processes."""
+"""Environments whose FMUs run in worker processes: what kills, wakes and interrupts these."""
 
 import os
 import signal
+from pathlib import Path
 
 import exchange_tools
 import numpy as np
 import pytest
-from combinations import in_turn
-from gymnasium.vector import AutoresetMode
-from process_tools import FaultyEnv, faulty_fmu, start_values
-from test_vector_tasks import Delayed, Goal, Tables, Tracking
+from process_tools import FaultyEnv, faulty_fmu, linux_only, start_values, wait_until
+from test_single_expressions import (
+    require_same_steps,
+    same,
+)
 from vector_tools import (
     CART_POLE,
     Drawing,
     require_equal,
-    results_of_both,
 )
-from ways import in_way
+from ways import in_python, in_way
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
@@ -43,61 +44,6 @@ class Short(Drawing):
 
     def __init__(self):
         super().__init__(max_episode_steps=7)
-
-
-class Sampled(fmugym.FMUEnv):
-    """What else the config may ask of a step."""
-
-    def __init__(self):
-        config = {
-            "model_input_names": "f",
-            "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
-            "bounds": {"f": (-20, 20)},
-            "time_step": 0.02,
-            "substeps": 2,
-            "warm_up": 0.1,
-            "start_time": 3.0,
-            "samplings": {"x": "mean"},
-            "monitor_names": ["phi_ddot"],
-        }
-        super().__init__(fmugym.bundled_fmu("CartPole"), config)
-
-    def _is_done(self):
-        return np.abs(self.state[2]) > 0.2
-
-
-class TwoPendulums(fmugym.FMUEnv):
-    """A system."""
-
-    def __init__(self):
-        pendulum = fmugym.bundled_fmu("Pendulum")
-        config = {
-            "model_input_names": "a.tau",
-            "model_output_names": ["a.theta", "b.theta"],
-            "model_parameters": {"a.theta_0": fmugym.Uniform(-0.1, 0.1), "b.theta_0": 0.3},
-            "bounds": {"a.tau": (-0.1, 0.1)},
-            "time_step": 0.02,
-            "max_episode_steps": 9,
-        }
-        super().__init__(fmugym.FMUSystem({"a": pendulum, "b": pendulum}, []), config)
-
-    def _is_done(self):
-        return np.abs(self.state[0]) > 3.0
-
-
-@in_turn(
-    {
-        "cls": [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables],
-        "mode": list(AutoresetMode),
-    }
-)
-def test_results_are_those_of_one_process(make, cls, mode):
-    """To the last bit, with episodes that start in every way."""
-    isolated = make(cls, 70, autoreset_mode=mode)
-    here = make(cls, 70, workers=None, autoreset_mode=mode)
-    list(results_of_both(isolated, here))
-    for name in ("variables", "previous_state", "action", "inputs", "step_count"):
-        np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
 
 
 def test_a_process_that_is_killed(make):
@@ -195,3 +141,65 @@ def test_a_pool_without_a_library_steps_nothing(make):
     around.close()
     with pytest.raises(SimulationError, match="closed"):
         around.step(None)
+
+
+@pytest.fixture(name="cart")
+def fixture_cart():
+    env = fmugym.envs.CartPoleEnv(isolation="process")
+    env.reset(seed=0)
+    env.step(0)
+    yield env
+    env.close()
+
+
+def test_a_process_of_a_single_environment_that_is_killed(cart):
+    """The episode is cut short; the next ones are as without a worker."""
+    other = in_python(fmugym.envs.CartPoleEnv())
+    other.reset(seed=0)
+    before = other.step(0)
+    os.kill(cart.pool.processes()[0], signal.SIGKILL)
+    observation, _, terminated, truncated, info = cart.step(1)
+    assert (terminated, truncated) == (False, True)
+    assert "SIGKILL" in info["fault"]
+    assert same(observation, before[0])
+    for env in (cart, other):
+        env.reset(seed=3)
+    require_same_steps(cart, other, 1, 0, 0, 1)
+    assert cart.health["deaths"] == 1
+
+
+@linux_only
+def test_a_worker_that_sleeps_is_woken(cart):
+    """It watches for the next message for 40 us only."""
+    (pid,) = cart.pool.processes()
+
+    def sleeps():
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
+
+    with in_python(fmugym.envs.CartPoleEnv()) as other:
+        other.reset(seed=0)
+        other.step(0)
+        for _ in range(3):
+            wait_until(sleeps)
+            require_same_steps(cart, other, 1)
+
+
+def test_interrupts_in_a_step_end_the_episode(cart):
+    env = cart
+
+    def ring(*_):
+        raise KeyboardInterrupt
+
+    usual = signal.signal(signal.SIGALRM, ring)
+    try:
+        os.kill(env.pool.processes()[0], signal.SIGSTOP)
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        with pytest.raises(KeyboardInterrupt):
+            env.step(1)
+    finally:
+        signal.signal(signal.SIGALRM, usual)
+    assert (env.step_count, env.action, env.previous_action) == (1, 1, 0)
+    with pytest.warns(UserWarning, match="after the end of the episode"):
+        env.step(1)
+    env.reset(seed=0)
+    assert env.step(1)[1] == 1.0
