@@ -179,6 +179,15 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
+def _kept(action: Any) -> Any:
+    """Copy the parts of an action that its caller may change before the next step."""
+    if isinstance(action, np.ndarray):
+        return action.copy()
+    if type(action) is dict:
+        return {name: _kept(part) for name, part in action.items()}
+    return type(action)(map(_kept, action)) if type(action) in (list, tuple) else action
+
+
 def take_action(env: Any, action: Any) -> tuple[Any, ...]:
     """Compute the FMU's inputs from an action, and write them for the next step.
 
@@ -196,6 +205,7 @@ def take_action(env: Any, action: Any) -> tuple[Any, ...]:
     elements, action = conversions.elements, _no_truth(env, action)
     if elements is None or type(action) not in _INTEGERS or action not in elements:
         _require_usable(env, action)
+        action = _kept(action)
         if env._expressed and not env._own_hooks.step:
             action = as_element(env, action)[()]  # expressions read its elements
     before: tuple[Any, ...] = read.keep()

@@ -341,8 +341,8 @@ class EpisodeStart:
         bits = rng.bit_generator
         with bits.lock:
             self._draw_natively(bits.capsule, self._row, self._drawn)
-        values = self._drawn.tolist()
-        return values
+        drawn: list[float] = self._drawn.tolist()
+        return drawn
 
     def _drawn_by(self, rng: np.random.Generator) -> list[float]:
         values = draw_all(self._distributions, rng)

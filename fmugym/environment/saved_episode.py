@@ -217,6 +217,8 @@ def _find_scope(env: Constructed) -> Scope:
 def _text(value: Any) -> str:
     if isinstance(value, Mapping):
         return f"{{{', '.join(f'{key!r}: {_text(part)}' for key, part in value.items())}}}"
+    if isinstance(value, np.ndarray) and value.dtype == np.object_:
+        return f"array of shape {value.shape}: {', '.join(map(_text, value.flat))}"
     if isinstance(value, np.ndarray):
         digest = hashlib.sha256(value.tobytes()).hexdigest()[:16]
         return f"array of {value.dtype}, shape {value.shape}, content {digest}"

@@ -45,7 +45,6 @@ class Case(NamedTuple):
         rtol: How far results may differ between a single environment and many.
         draws: Whether its episodes begin with drawn values.
         can_save: Whether episodes keep all in their variables, so that they can be saved.
-        not_restored: The reason why another environment cannot restore its episodes yet.
         has_one_action: Whether an action is one array, as rollouts take them.
         has_faults: Whether episodes end by faults.
         usual: An action without a fault, where one of the actions leads to a fault.
@@ -57,7 +56,6 @@ class Case(NamedTuple):
     rtol: float = 0.0
     draws: bool = True
     can_save: bool = True
-    not_restored: str = ""
     has_one_action: bool = True
     has_faults: bool = False
     usual: Any = None
@@ -581,21 +579,17 @@ def writing(hook):
     return Writing
 
 
-DISTRIBUTIONS = "configs with distributions in arrays are never those of other environments"
 VARIABLES = {
     "sums are made in place": Case(Summing),
     "variables are swapped": Case(Swapping),
     "variables change their types": Case(Changing),
     "a variable is an index": Case(Queueing),
-    "variables hold several numbers": Case(
-        Historic, not_restored="on arrays, a number that becomes an array is not restored"
-    ),
+    "variables hold several numbers": Case(Historic),
     "a target is drawn": Case(Tracking, rtol=ROUNDED),
     "variables hold histories": Case(Delayed, rtol=ROUNDED),
-    "elements are drawn": Case(Targets, not_restored=DISTRIBUTIONS),
+    "elements are drawn": Case(Targets),
     "elements are drawn by Python alone": Case(
         functools.partial(Targets, {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}),
-        not_restored=DISTRIBUTIONS,
     ),
     **{
         f"{hook} writes a variable": Case(writing(hook), (EACH,), can_save=False)

@@ -180,6 +180,14 @@ class ArrayEpisodes(Episodes):
             self._parameters[name] = row
         return row
 
+    def _row_for(self, name: str, shape: tuple[int, ...]) -> FloatArray:
+        """The row for values of a shape; hooks may have made arrays of what starts as a number."""
+        row = self.row(name)
+        if shape and row.ndim == 1:
+            row = np.array(np.broadcast_to(row, (*shape, self._n)))
+            self.prototype.variables[name] = row
+        return row
+
     def _put(self, values: Mapping[str, Any], indices: IndexArray | slice) -> None:
         for name, value in values.items():
             self.row(name)[..., indices] = value
@@ -236,7 +244,7 @@ class ArrayEpisodes(Episodes):
             if name in self._strings:
                 self._put_parameter(name, np.array(values, object)[whence], where)
             else:
-                place_column(self.row(name), values, whence, where)
+                place_column(self._row_for(name, np.shape(values)[1:]), values, whence, where)
         if isinstance(columns["streams"], np.ndarray):
             seeds = np.array(columns["seeds"], object)[whence]
             self.streams.put(where, columns["streams"][whence], seeds)
