@@ -29,10 +29,13 @@ static void free_access(PyObject *capsule) {
 }
 
 PyObject *py_access(PyObject *module, PyObject *form) {
+    (void)module;
+    if (!PyBytes_Check(form)) {
+        PyErr_SetString(PyExc_TypeError, "a list of variables must be bytes");
+        return NULL;
+    }
     Access *access = calloc(1, sizeof *access);
     PyObject *capsule = access == NULL ? PyErr_NoMemory() : PyCapsule_New(access, ACCESS, free_access);
-
-    (void)module;
     if (capsule == NULL) {
         free(access);
         return NULL;
