@@ -300,6 +300,8 @@ def require_scope(own: Scope, wanted: Scope, what: str) -> None:
         ConfigError: If they differ; the text names the first difference, and of long values only
             the parts that differ.
     """
+    if own == wanted:
+        return
     for name in dict.fromkeys([*own, *wanted]):
         texts = own.get(name, "nothing"), wanted.get(name, "nothing")
         if texts[0] != texts[1]:

@@ -237,7 +237,8 @@ class ArrayEpisodes(Episodes):
 
     def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
         """See ``Episodes.place``."""
-        whence = which_of(sources, len(columns["step_count"]))
+        count = len(columns["step_count"])
+        whence = slice(None) if count == 1 else which_of(sources, count)  # one is placed in all
         where = which_of(indices, self._n)
         place_batch(self.prototype, columns, whence, where)
         for name, values in (columns["parameters"] | columns["variables"]).items():

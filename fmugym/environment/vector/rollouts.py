@@ -309,9 +309,10 @@ class Rollout(_Steps):
         first = ends.argmax(axis=0) + 1 if horizon else np.zeros(rewards.shape[1], np.int64)
         lengths = np.where(ends.any(axis=0), first, horizon)
         turned = mapped(lambda array: np.swapaxes(array, 0, 1), observations)
-        runs = np.arange(horizon)[:, np.newaxis] < lengths
         found = cls(turned, rewards.T, terminated.T, truncated.T, lengths)
-        found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
+        if costs:
+            runs = np.arange(horizon)[:, np.newaxis] < lengths
+            found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
         found.has_failed = has_failed
         return found
 
