@@ -12,6 +12,7 @@ import makers
 import pytest
 import quirk_table
 import zoo_tools
+from command_tasks import PRICES
 from fmu_tools import edited_fmu, library_name, probe_fmu, read_fmu
 from plants import ONCE
 from process_tools import run_python
@@ -503,29 +504,13 @@ class TestTasks:
         fmugym.load(tmp_path / "task.toml").close()
 
 
-DATA = """
-fmu = { bundled = "Pendulum" }
-time_step = "1h"
-clock = "03-01"
-reward = "-p"
-[data]
-p = { file = "prices.csv", column = "p", interpolation = "previous", timezone = "Europe/Berlin" }
-q = { file = "prices.csv", column = 3, gaps = "3h", timezone = "Europe/Berlin" }
-[agent]
-actions = ["tau"]
-observations = ["p", "q", "q_dot"]
-[variables]
-tau = { min = -1, max = 1 }
-"""
-
-
 @pytest.fixture
 def task(tmp_path):
     hours = [*range(3), *range(3, 24)]
     rows = [f"2024-10-27 {hour:02d}:00;{hour},5;{hour if hour != 9 else ''}" for hour in hours]
     rows.insert(3, "2024-10-27 02:00;2,75;2")
     (tmp_path / "prices.csv").write_text("\n".join(["time;p;q", *rows, ""]), encoding="utf-8")
-    (tmp_path / "task.toml").write_text(DATA, encoding="utf-8")
+    (tmp_path / "task.toml").write_text(PRICES, encoding="utf-8")
     return tmp_path / "task.toml"
 
 
@@ -549,10 +534,12 @@ def test_info_as_json(ran, task):
 
 
 def test_info_says_what_is_wrong_and_of_an_fmu_nothing(ran, task):
-    task.write_text(DATA.replace("prices", "prises", 1), encoding="utf-8")
+    task.write_text(PRICES.replace("prices", "prises", 1), encoding="utf-8")
     out = ran("info", task)
     assert "unknown file 'prises.csv'; did you mean 'prices.csv'?" in out
-    task.write_text(DATA.partition("[data]")[0] + DATA[DATA.index("[agent]") :], encoding="utf-8")
+    task.write_text(
+        PRICES.partition("[data]")[0] + PRICES[PRICES.index("[agent]") :], encoding="utf-8"
+    )
     assert "\nData" not in ran("info", task)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from command_tasks import PRICES, TURN
 from fmu_tools import interrupted_after
 from letters import wide
 
@@ -225,16 +226,6 @@ class TestInterruption:
         assert (code, [one["envs"] for one in json.loads(out)["speeds"]]) == (130, [0])
 
 
-TASK = {
-    "fmu": {"bundled": "Pendulum"},
-    "time_step": 0.02,
-    "episode_length": "1s",
-    "variables": {"tau": {"min": -0.01, "max": 0.01}, "q": {"min": -20, "max": 20}},
-    "agent": {"actions": ["tau"], "observations": ["q"]},
-    "reward": "-abs(q - 1)",
-}
-
-
 class TestSimulate:
     def test_random_episodes_have_the_seeds_that_were_given(self, cli):
         task = CART_POLE
@@ -264,7 +255,7 @@ class TestSimulate:
         assert json.loads(both)["episodes"][1] == json.loads(second)["episodes"][0]
 
     def test_a_table_of_all_steps(self, tmp_path, ran):
-        fmugym.Task.from_dict(TASK | {"costs": {"effort": "abs(tau)"}}).write(tmp_path / "a.toml")
+        fmugym.Task.from_dict(TURN | {"costs": {"effort": "abs(tau)"}}).write(tmp_path / "a.toml")
         arguments = "--action", "0.01", "--output", tmp_path / "run.csv"
         out = ran("simulate", tmp_path / "a.toml", *arguments)
         assert "cost 0.5 in 50 steps (1 s), truncated" in out
@@ -278,27 +269,11 @@ class TestSimulate:
         assert rows[-1]["truncated"] == "1"
 
 
-LOCAL = """
-fmu = { bundled = "Pendulum" }
-time_step = "1h"
-clock = "03-01"
-reward = "-p"
-[data]
-p = { file = "prices.csv", column = "p", interpolation = "previous", timezone = "Europe/Berlin" }
-q = { file = "prices.csv", column = 3, gaps = "3h", timezone = "Europe/Berlin" }
-[agent]
-actions = ["tau"]
-observations = ["p", "q", "q_dot"]
-[variables]
-tau = { min = -1, max = 1 }
-"""
-
-
 def test_a_log_of_local_time_needs_its_zone(refused, tmp_path):
     pytest.importorskip("minari", reason="needs Minari: the extra minari")
     task = tmp_path / "task.toml"
-    task.write_text('timezone = "+01:00"' + LOCAL.partition("[data]")[0].replace("-p", "-q**2"))
-    more = LOCAL[LOCAL.index("[agent]") :].replace('"p", "q", "q_dot"', '"q", "q_dot"')
+    task.write_text('timezone = "+01:00"' + PRICES.partition("[data]")[0].replace("-p", "-q**2"))
+    more = PRICES[PRICES.index("[agent]") :].replace('"p", "q", "q_dot"', '"q", "q_dot"')
     task.write_text(task.read_text() + more, encoding="utf-8")
     rows = [f"2024-10-27 0{hour}:00,0,0,0" for hour in (1, 2, 2, 3)]
     (tmp_path / "log.csv").write_text("\n".join(["time,q,q_dot,tau", *rows]), encoding="utf-8")

@@ -4,6 +4,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from command_tasks import TURN
 
 import fmugym
 from fmugym.cli import validation
@@ -11,27 +12,17 @@ from fmugym.cli.validation import validate
 from fmugym.control import controller_of
 from fmugym.records.players import policy_of, simulate
 
-TASK = {
-    "fmu": {"bundled": "Pendulum"},
-    "time_step": 0.02,
-    "episode_length": "1s",
-    "variables": {"tau": {"min": -0.01, "max": 0.01}, "q": {"min": -20, "max": 20}},
-    "agent": {"actions": ["tau"], "observations": ["q"]},
-    "reward": "-abs(q - 1)",
-}
-
-
 DEFECTS = {
     "useless action": (
         {
-            "variables": {"idle": {"min": 0, "max": 1}} | TASK["variables"],
+            "variables": {"idle": {"min": 0, "max": 1}} | TURN["variables"],
             "agent": {"actions": ["tau", "idle"], "observations": ["q"]},
         },
         ("warning", "actions", "element 1"),
     ),
     "an action that only the reward knows": (
         {
-            "variables": {"fee": {"min": 0, "max": 1}} | TASK["variables"],
+            "variables": {"fee": {"min": 0, "max": 1}} | TURN["variables"],
             "agent": {"actions": ["tau", "fee"], "observations": ["q"]},
             "reward": "-abs(q - 1) - fee",
         },
@@ -94,7 +85,7 @@ DEFECTS = {
 class TestValidate:
     @pytest.mark.parametrize(("change", "expected"), DEFECTS.values(), ids=DEFECTS)
     def test_defects_are_found_and_cured(self, change, expected):
-        task = {key: value for key, value in (TASK | change).items() if value is not None}
+        task = {key: value for key, value in (TURN | change).items() if value is not None}
         report = validate(lambda: fmugym.load(task))
         verdict, check, text = expected
         (finding,) = [one for one in report.findings if one.verdict != "ok"]
@@ -107,13 +98,13 @@ class TestValidate:
     @pytest.mark.parametrize("normalize", [False, True])
     def test_figures_are_in_the_units_of_the_task(self, normalize):
         variables = {"tau": {"min": -0.01, "max": 0.01}, "q": {"unit": "deg", "min": 1, "max": 5}}
-        task = TASK | {"variables": variables, "agent": TASK["agent"] | {"normalize": normalize}}
+        task = TURN | {"variables": variables, "agent": TURN["agent"] | {"normalize": normalize}}
         (finding,) = [one for one in validate(lambda: fmugym.load(task)).findings if one.cure]
         assert "limits: q (-" in finding.text
         assert "to 180.1 deg)" in finding.text
 
     def test_a_sound_task(self):
-        report = validate(lambda: fmugym.load(TASK))
+        report = validate(lambda: fmugym.load(TURN))
         assert report.verdict == "ok"
         assert report.hooks == "expressions"
         (export,) = [one.text for one in report.findings if one.check == "export"]
@@ -125,7 +116,7 @@ class TestValidate:
         assert report.recommended["reset_method"] == report.reset_method
 
     def test_an_error_gives_the_exit_code(self, tmp_path, cli):
-        fmugym.Task.from_dict(TASK | {"reward": "1 / (step - 3)"}).write(tmp_path / "a.toml")
+        fmugym.Task.from_dict(TURN | {"reward": "1 / (step - 3)"}).write(tmp_path / "a.toml")
         code, out, _ = cli("validate", tmp_path / "a.toml")
         assert code == 1
         assert "error    run: step 3" in out
