@@ -43,7 +43,13 @@ from fmugym.cli.options import (
     tell,
     watched,
 )
-from fmugym.cli.plant_commands import add_of_plants, evaluate_log, follow_plant, plant_task
+from fmugym.cli.plant_commands import (
+    add_of_plants,
+    check_plant_options,
+    evaluate_log,
+    follow_plant,
+    plant_task,
+)
 from fmugym.cli.task_arguments import maker_of, player_maker, scenarios_of
 from fmugym.control.candidate_evaluation import most_steps_of
 from fmugym.environment.env import FMUEnv
@@ -269,6 +275,7 @@ def add_simulate(commands: Commands) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     check_counts(arguments, "episodes", "steps")
+    check_plant_options(arguments)
     if dataset_of(arguments) is not None:
         make_dataset(arguments)
         return 0

@@ -42,7 +42,14 @@ from fmugym.records.recording import Recording
 from fmugym.task import Task, load
 from fmugym.task.task_writer import as_toml
 
-__all__ = ["add_of_plants", "add_serve", "evaluate_log", "follow_plant", "plant_task"]
+__all__ = [
+    "add_of_plants",
+    "add_serve",
+    "check_plant_options",
+    "evaluate_log",
+    "follow_plant",
+    "plant_task",
+]
 
 _AHEAD: Final = "3h"
 
@@ -53,17 +60,25 @@ def add_of_plants(command: argparse.ArgumentParser) -> None:
     text = "read the plant that [plant] of the task describes, or at another address; write nothing"
     group.add_argument("--plant", nargs="?", const="", metavar="ADDRESS", help=text)
     text = f"how far ahead copies of the FMU predict; default {_AHEAD}"
-    group.add_argument("--ahead", metavar="TIME", default=_AHEAD, help=text)
+    group.add_argument("--ahead", metavar="TIME", help=text)
     _add_speed(group)
+
+
+def check_plant_options(arguments: argparse.Namespace) -> None:
+    """Refuse the options of ``simulate --plant`` without it."""
+    for name in ("ahead", "speed"):
+        if arguments.plant is None and getattr(arguments, name) is not None:
+            raise ConfigError(f"--{name} is for --plant")
 
 
 def _add_speed(command: Any) -> None:
     text = "seconds of the plant in a second of real time; default 1"
-    command.add_argument("--speed", type=float, default=1.0, help=text)
+    command.add_argument("--speed", type=float, help=text)
 
 
 def _clock(arguments: argparse.Namespace) -> RealClock:
-    return RealClock(check_number("--speed", arguments.speed, positive=True))
+    speed = 1.0 if arguments.speed is None else arguments.speed
+    return RealClock(check_number("--speed", speed, positive=True))
 
 
 def plant_task(arguments: argparse.Namespace) -> Task:
@@ -82,7 +97,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
     if arguments.scenario is not None or arguments.episodes != 1:
         raise ConfigError("a plant has no --scenario and no --episodes: say --steps")
     player = only_player(arguments)
-    ahead = duration("--ahead", arguments.ahead)
+    ahead = duration("--ahead", _AHEAD if arguments.ahead is None else arguments.ahead)
     make_env: Any = partial(
         connect,
         plant_task(arguments),

@@ -354,17 +354,9 @@ class TestRefusals:
         before = contents(folder)
         for option, kind in numbers_of(name).items():
             for wrong in ("-1",) if kind is int else ("-1", "nan"):
-                line = command_mistakes.refusal(
-                    *row.arguments, *PARTNERS.get((name, option), ()), option, wrong, code=1
-                )
+                line = command_mistakes.refusal(*row.arguments, option, wrong, code=1)
                 assert wrong in line or option in line
         assert contents(folder) == before
-
-
-PARTNERS = {
-    ("simulate", "--speed"): ("--plant",),
-}
-"""Options without which a number is not looked at."""
 
 
 def options_of(name):

@@ -101,6 +101,8 @@ MISTAKES: Final[Mapping[str, Facts]] = {
     "simulate task.toml --output a.csv --every 0.03": ("0.03", "0.02"),
     "simulate task.toml --output a.csv --action 0 --action 0.01": ("a.csv", "2"),
     "simulate task.toml --timezone UTC": ("--timezone is for datasets",),
+    "simulate task.toml --speed 2": ("--speed is for --plant",),
+    "simulate task.toml --ahead 6h": ("--ahead is for --plant",),
     "simulate task.toml --output minari:a/b-v0 --output a.csv": ("alone", "2 outputs"),
     "simulate task.toml --plant --scenario frost": ("--scenario", "--steps"),
     "simulate fmugym/Pendulum-v0 --plant": ("'fmugym/Pendulum-v0'", "task file"),
