@@ -72,6 +72,7 @@ def test_an_agent_in_onnx_computes_what_programs_do(agent, tmp_path):
 
     Its zeros have no sign.
     """
+    pytest.importorskip("onnx", reason="needs the extra 'onnx'")
     a, b = np.random.default_rng(0).uniform(-3.0, 3.0, (2, 400))
     a[:100], b[:100] = np.round(a[:100]) + 0.0, np.round(b[:100]) + 0.0
     a[100:200] /= 3.1

@@ -254,13 +254,18 @@ def refusal(*arguments: Any, code: int | None = None) -> str:
     return line
 
 
+def files_in(folder: Path) -> list[Path]:
+    """All files, but for the classes that Python has compiled."""
+    return sorted(path for path in folder.rglob("*") if "__pycache__" not in path.parts)
+
+
 def require_refusal(line: str, facts: Facts, folder: Path) -> None:
     """Run a mistake: its facts are told, and the folder stays as it was."""
-    before = sorted(folder.rglob("*"))
+    before = files_in(folder)
     said = refusal(*shlex.split(line))
     missing = [fact for fact in facts if fact not in said]
     assert not missing, (said, missing)
-    assert sorted(folder.rglob("*")) == before
+    assert files_in(folder) == before
 
 
 if __name__ == "__main__":
