@@ -263,6 +263,8 @@ SLOW_TESTS = (
     "test_commands.py::TestCtrlC::test_it_ends_a_command_at_any_moment[0.3",
     "test_commands.py::TestCtrlC::test_it_ends_a_command_at_any_moment[0.9",
     "test_cli_training.py::TestTrain::test_an_agent_learns",
+    "test_streams.py::test_many_normal_numbers",
+    "test_notebooks.py::test_figures_are_pictures",
 )
 """Others, by the beginning of their node ids."""
 
