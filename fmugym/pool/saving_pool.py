@@ -5,6 +5,7 @@ Recorded inputs of an episode may be in its saved state.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 from abc import abstractmethod
@@ -235,13 +236,21 @@ class SavingPool(RetryingPool):
             SimulationError: If the FMU offers no state, or an instance cannot save it now.
         """
         number = next(self._numbers)
-        dropped = [self._dropped.popleft() for _ in range(len(self._dropped))]
+        dropped = self._taken_dropped()
         try:
             self._save_snapshot(number, dropped)
         except BaseException:  # some workers may have saved
             self._dropped.extend((number, *dropped))
             raise
         return InstanceSnapshot(self, number, self._dropped)
+
+    def _taken_dropped(self) -> list[int]:
+        """The snapshots that nobody needs any more; another thread may take some of them."""
+        taken: list[int] = []
+        with contextlib.suppress(IndexError):
+            while True:
+                taken.append(self._dropped.popleft())
+        return taken
 
     @abstractmethod
     def _save_snapshot(self, number: int, dropped: Sequence[int]) -> None:

@@ -23,7 +23,7 @@ from pythonfmu.builder import FmuBuilder
 from test_native_pool import busy_fmu, make
 from ways import in_way
 
-from fmugym import FMU, SimulationError
+from fmugym import FMU, SimulationError, bundled_fmu
 from fmugym.environment.vector import FMUVectorEnv
 from fmugym.pool import PoolSpec
 from fmugym.pool.native_pool import NativePool
@@ -190,6 +190,24 @@ def test_a_snapshot_dropped_while_the_pool_is_busy_is_freed_with_the_next_one(pr
 
 
 # Helpers
+
+
+def test_threads_save_and_drop_snapshots_at_once():
+    pool = make(NativePool, bundled_fmu("CartPole"), ["f"], ["x"], 2)
+    pool.reset((), np.zeros((0, 2)))
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+
+    def save(_):
+        for _ in range(3000):
+            pool.save()  # and drops it
+
+    try:
+        with concurrent.futures.ThreadPoolExecutor(4) as threads:
+            assert list(threads.map(save, range(4))) == [None] * 4
+    finally:
+        sys.setswitchinterval(before)
+        pool.close()
 
 
 def helper_masks():
