@@ -90,7 +90,7 @@ Draws = tuple[bytes, int, int]
 addresses of numpy's ``random_standard_normal`` and of ``exp`` behind ``math.exp``, or 0."""
 
 def draw(draws: Draws, streams: Array, values: Array, /) -> None:
-    """Draw an episode from each of M streams; ``given`` values stay.
+    """Draw an episode from each of M streams.
 
     Args:
         draws: The draws.
