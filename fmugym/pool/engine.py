@@ -39,6 +39,7 @@ __all__ = [
     "read_values",
     "request_listing",
     "request_restore",
+    "request_restore_snapshot",
     "request_save",
 ]
 
@@ -224,16 +225,18 @@ def request_save(
     return writer.array(dropped, np.int64).form()
 
 
-def request_restore(
-    states: Sequence[bytes], indices: IndexArray, snapshot: int = NO_SNAPSHOT
-) -> bytes:
-    """Restore states, or a snapshot. A state that several instances get is there once."""
-    places = {state: place for place, state in enumerate(dict.fromkeys(states))}
-    writer = Writer().array(indices, np.int64).integers(snapshot)
-    writer.array([places[state] for state in states], np.int64)
-    for state in places:
-        writer.block(state)
+def request_restore(states: Sequence[bytes], sources: IndexArray, indices: IndexArray) -> bytes:
+    """Restore states: ``indices[i]`` gets ``states[sources[i]]``, which is sent once."""
+    used, places = np.unique(sources, return_inverse=True)
+    writer = Writer().array(indices, np.int64).integers(NO_SNAPSHOT).array(places, np.int64)
+    for place in used.tolist():
+        writer.block(states[place])
     return writer.form()
+
+
+def request_restore_snapshot(number: int, indices: IndexArray) -> bytes:
+    """Restore a snapshot."""
+    return Writer().array(indices, np.int64).integers(number).array([], np.int64).form()
 
 
 R = TypeVar("R")

@@ -35,6 +35,7 @@ from fmugym.pool.engine import (
     Request,
     read_states,
     request_restore,
+    request_restore_snapshot,
     request_save,
 )
 from fmugym.pool.failure_texts import FRESH_PROCESSES, REFUSED_ANEW, Receiver, loading_failed
@@ -223,13 +224,15 @@ class NativePool(EnginePool):
             Request.SAVE, content, lambda reader: read_states(reader, len(indices), outputs)
         )
 
-    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+    def restore_states(
+        self, states: Sequence[bytes], sources: IndexArray, indices: IndexArray
+    ) -> None:
         """See ``SavingPool.restore_states``."""
-        self._ask_pool(Request.RESTORE, request_restore(states, indices), Reader.end)
+        self._ask_pool(Request.RESTORE, request_restore(states, sources, indices), Reader.end)
 
     def _restore_snapshot(self, number: int, mask: MaskArray) -> None:
         """See ``SavingPool._restore_snapshot``."""
-        content = request_restore((), np.flatnonzero(mask), number)
+        content = request_restore_snapshot(number, np.flatnonzero(mask))
         self._ask_pool(Request.RESTORE, content, Reader.end)
 
     def _count_steps(self) -> None:

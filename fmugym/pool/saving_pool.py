@@ -194,18 +194,17 @@ class SavingPool(RetryingPool):
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> npt.NDArray[np.int8]:
         """See ``Pool.restore_instances``."""
-        states = bundle.states_at(sources)
         if bundle.replays:
             there = self._restore_copies(bundle, sources, indices)
-            there |= [not head_of(state).is_record for state in states]
-            self._replay(list(itertools.compress(states, ~there)), indices[~there])
-            states, indices = tuple(itertools.compress(states, there)), indices[there]
+            there |= ~np.array([head.is_record for head in bundle.heads])[sources]
+            self._replay(bundle.states_at(sources[~there]), indices[~there])
+            sources, indices = sources[there], indices[there]
         elif self.save_method is not SaveMethod.STATE:
             raise SimulationError(
                 "the snapshot has serialized FMU states, which do not work in this pool"
             )
-        if states:
-            self.restore_states(states, indices)
+        if len(indices):
+            self.restore_states(bundle.states, sources, indices)
         return self.statuses
 
     @abstractmethod
@@ -217,10 +216,16 @@ class SavingPool(RetryingPool):
         """
 
     @abstractmethod
-    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+    def restore_states(
+        self, states: Sequence[bytes], sources: IndexArray, indices: IndexArray
+    ) -> None:
         """Restore a state in each of some instances.
 
-        A record only tells what the episode was of an instance that is where it leads to.
+        Args:
+            states: The states; a record only tells what the episode was of an instance that is
+                where it leads to.
+            sources: Which of them the instances get, shape (M,).
+            indices: The instances, shape (M,).
         """
 
     # Copies

@@ -119,7 +119,7 @@ class TestRecords:
         for step in range(40):
             pool.step(np.array([[0.0, step]]), np.array([True, False]))
         (state,) = pool.save_states(np.array([1]), True)
-        pool.restore_states([state], np.array([0]))
+        pool.restore_states([state], np.array([0]), np.array([0]))
         pool.step(np.full((1, 2), 9.0))
         found = [inputs_in(*pool._form, one) for one in pool.save_states(np.arange(2), True)]
         for record in found:
@@ -167,19 +167,20 @@ class TestStates:
         with pytest.raises(SimulationError, match="a list of instances is damaged"):
             pool.save_states(np.array([index]), False)
         with pytest.raises(SimulationError, match="a list of instances is damaged"):
-            pool.restore_states([state], np.array([index]))
+            pool.restore_states([state], np.array([0]), np.array([index]))
 
     @pytest.mark.parametrize("records", [False, True])
     def test_that_are_cut_off(self, pool, records):
         """However much of a state is there, it is whole or refused."""
-        (state,) = pool.save_states(np.zeros(1, np.int64), records)
+        first = np.zeros(1, np.int64)
+        (state,) = pool.save_states(first, records)
         is_whole = {len(state)} if records else set(range(49, len(state) + 1))
         for size in range(len(state) + 1):
             if size not in is_whole:
                 with pytest.raises(SimulationError, match="damaged"):
-                    pool.restore_states([state[:size]], np.zeros(1, np.int64))
-        pool.restore_states([state], np.zeros(1, np.int64))
-        assert pool.save_states(np.zeros(1, np.int64), records) == [state]
+                    pool.restore_states([state[:size]], first, first)
+        pool.restore_states([state], first, first)
+        assert pool.save_states(first, records) == [state]
 
     @pytest.mark.parametrize(
         "head",
@@ -190,17 +191,18 @@ class TestStates:
         kind, starts, rows = head
         damaged = struct.pack("<qqdqq", kind, 1, 0.0, starts, rows) + state[40:]
         with pytest.raises(SimulationError, match="damaged"):
-            pool.restore_states([damaged], np.zeros(1, np.int64))
+            pool.restore_states([damaged], np.array([0]), np.array([0]))
 
     def test_of_the_wrong_kind(self, pool):
+        both, first = np.arange(2), np.zeros(1, np.int64)
         for states in (None, [None], ["text"]):
             with pytest.raises(TypeError):
-                pool.restore_states(states, np.zeros(1, np.int64))
-        states = pool.save_states(np.arange(2), False)
+                pool.restore_states(states, first, first)
+        states = pool.save_states(both, False)
         with pytest.raises(SimulationError, match="a list of instances is damaged"):
-            pool.restore_states(states, np.zeros(2, np.int64))
+            pool.restore_states(states, both, np.zeros(2, np.int64))
         with pytest.raises(SimulationError, match="the states differ in number"):
-            pool.restore_states(states, np.zeros(1, np.int64))
+            pool.restore_states(states, both, first)
 
 
 # Programs

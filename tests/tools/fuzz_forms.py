@@ -338,7 +338,8 @@ def save_states(rng, pool, kept):
 
 def restore_states(rng, pool, kept):
     if "states" in kept:
-        pool.restore_states(kept["states"], np.arange(N))
+        sources = np.array(rng.choices(range(N), k=N))
+        pool.restore_states(kept["states"], sources, np.arange(N))
 
 
 def read(rng, pool, kept):

@@ -226,7 +226,7 @@ class Subject:
         if bundled:
             indices = self.rng.permutation(self.n)[: int(self.rng.integers(1, self.n + 1))]
             sources = self.rng.integers(len(bundled), size=len(indices))
-            self.pool.restore_states([bundled[source] for source in sources], indices)
+            self.pool.restore_states(bundled, sources, indices)
 
     def write(self):
         self.pool.write(self.spec.inputs, np.zeros_like(self.pool.inputs))

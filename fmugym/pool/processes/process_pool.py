@@ -25,7 +25,14 @@ from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.fmu import FMU, extracted_again
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.fmi.variable import Variable
-from fmugym.pool.engine import Answer, EnginePool, Reader, Request, request_listing, request_restore
+from fmugym.pool.engine import (
+    Answer,
+    EnginePool,
+    Reader,
+    Request,
+    request_listing,
+    request_restore_snapshot,
+)
 from fmugym.pool.failure_texts import REFUSED_ANEW
 from fmugym.pool.health import Column, new_arrays
 from fmugym.pool.licences import speaks_of_licence
@@ -261,7 +268,7 @@ class ProcessPool(EnginePool):
 
         def tell(supervisor: Supervisor) -> None:
             indices = np.flatnonzero(mask[supervisor.block])
-            supervisor.tell(Request.RESTORE, request_restore((), indices, number))
+            supervisor.tell(Request.RESTORE, request_restore_snapshot(number, indices))
 
         with self._lock:
             self._require_present(mask)
@@ -273,10 +280,12 @@ class ProcessPool(EnginePool):
         with self._lock:
             return self._states.save(indices, records, self._spec.start_time, self.outputs)
 
-    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+    def restore_states(
+        self, states: Sequence[bytes], sources: IndexArray, indices: IndexArray
+    ) -> None:
         """See ``SavingPool.restore_states``; a lost worker is replaced."""
         with self._lock:
-            self._states.restore(states, indices)
+            self._states.restore(states, sources, indices)
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""

@@ -278,16 +278,17 @@ class StatesOfWorkers:
         states |= {index: ended_state(start_time, outputs[:, index]) for index in lost}
         return [states[index] for index in indices.tolist()]
 
-    def restore(self, states: Sequence[bytes], indices: IndexArray) -> None:
+    def restore(self, states: Sequence[bytes], sources: IndexArray, indices: IndexArray) -> None:
         """Restore instances; a lost worker is replaced."""
         parts = self._by_worker(indices)
-        state_of = dict(zip(indices.tolist(), states, strict=True))
+        source_of = dict(zip(indices.tolist(), sources.tolist(), strict=True))
         alive = self._group.revive(parts)
 
         def tell(supervisor: Supervisor) -> None:
             wanted = parts[supervisor]
-            own = [state_of[index] for index in wanted.tolist()]
-            supervisor.tell(Request.RESTORE, request_restore(own, _within(supervisor, wanted)))
+            own = np.array([source_of[index] for index in wanted.tolist()], np.int64)
+            content = request_restore(states, own, _within(supervisor, wanted))
+            supervisor.tell(Request.RESTORE, content)
 
         for supervisor in self._group.run("restoring states", alive, tell):
             supervisor.note_success()

@@ -128,7 +128,7 @@ def test_a_request_that_nobody_reads(deceived):
     pool = deceived(ignore)
     states = [bytes(4 * 2**20)] * 2
     begin = time.monotonic()
-    pool.restore_states(states, np.arange(2))
+    pool.restore_states(states, np.arange(2), np.arange(2))
     assert time.monotonic() - begin < 10.0
     with pytest.raises(SimulationError, match="took longer than call_timeout"):
         pool.save()
