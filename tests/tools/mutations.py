@@ -113,9 +113,9 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "pool",
-        "pool/states.py",
-        "if np.array_equal(places, np.arange(len(self.states))):",
-        "if len(places) == len(self.states):",
+        "pool/engine.py",
+        ".array(places, np.int64)",
+        ".array(np.sort(places), np.int64)",
         "instances that are to change places go on from their own states",
     ),
     Mutation(
