@@ -141,3 +141,18 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
         }
     }
 }
+
+bool program_evaluate(const Program *program, size_t count) {
+    static const Source source;
+    Register memory[PROGRAM_REGISTERS];
+    Registers registers;
+    Notes notes = {.outside = false};
+
+    program_prepare(program, memory, &registers);
+    for (size_t begin = 0; begin < count; begin += PROGRAM_WIDTH) {
+        const size_t rest = count - begin;
+        program_run(program, &source, begin, rest < PROGRAM_WIDTH ? rest : PROGRAM_WIDTH,
+                    &registers, &notes);
+    }
+    return notes.outside;
+}

@@ -206,4 +206,8 @@ bool program_is_sound(const Program *program);
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers *registers, Notes *notes);
 
+/* Evaluates a program outside of a play, for count instances; all of its rows are in memory that stays.
+ * Returns whether it looked up an index outside of a table. */
+bool program_evaluate(const Program *program, size_t count);
+
 #endif

@@ -41,21 +41,6 @@ Row *take_rows(PyObject *tuple, npy_intp length) {
 
 /* Evaluating a program alone */
 
-static bool evaluate(const Program *program, size_t count) {
-    static const Source source;
-    Register memory[PROGRAM_REGISTERS];
-    Registers registers;
-    Notes notes = {.outside = false};
-
-    program_prepare(program, memory, &registers);
-    for (size_t begin = 0; begin < count; begin += PROGRAM_WIDTH) {
-        const size_t rest = count - begin;
-        program_run(program, &source, begin, rest < PROGRAM_WIDTH ? rest : PROGRAM_WIDTH,
-                    &registers, &notes);
-    }
-    return notes.outside;
-}
-
 static PyObject *evaluate_form(const char *form, size_t size, PyObject *tuple, Py_ssize_t count) {
     Row *rows = take_rows(tuple, count);
     ProgramForm program;
@@ -68,7 +53,7 @@ static PyObject *evaluate_form(const char *form, size_t size, PyObject *tuple, P
         fault = program_settle(&program, rows);
     }
     PyObject *result = require_no_fault("a program", fault)
-                           ? PyBool_FromLong(evaluate(&program.program, (size_t)count))
+                           ? PyBool_FromLong(program_evaluate(&program.program, (size_t)count))
                            : NULL;
     program_drop(&program);
     free(rows);
