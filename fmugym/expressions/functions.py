@@ -8,7 +8,16 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-__all__ = ["FUNCTIONS", "Function", "chance", "clip", "maximum", "minimum", "noise"]
+__all__ = [
+    "FUNCTIONS",
+    "Function",
+    "chance",
+    "clip",
+    "maximum",
+    "minimum",
+    "noise",
+    "splitmix64",
+]
 
 
 class Function(NamedTuple):
@@ -38,8 +47,8 @@ def _shifted(word: Any, bits: int) -> Any:
     return (word >> np.int64(bits)) & np.int64(2 ** (64 - bits) - 1)
 
 
-def _mixed(word: Any) -> Any:
-    """Mix 64 bits as SplitMix64 does."""
+def splitmix64(word: Any) -> Any:
+    """64 random bits that SplitMix64 makes of its state, 64 bits."""
     word = (word ^ _shifted(word, 30)) * _FIRST
     word = (word ^ _shifted(word, 27)) * _SECOND
     return word ^ _shifted(word, 31)
@@ -47,8 +56,8 @@ def _mixed(word: Any) -> Any:
 
 def _word(key: Any, count: Any, channel: int) -> Any:
     """64 random bits that are a function of the arguments; see ``noise``."""
-    episode = _mixed(key.cast(np.int64) + _STEP)
-    return _mixed(episode + count.cast(np.int64) * _STEP + np.int64(channel))
+    episode = splitmix64(key.cast(np.int64) + _STEP)
+    return splitmix64(episode + count.cast(np.int64) * _STEP + np.int64(channel))
 
 
 def _fraction(word: Any) -> Any:
@@ -58,7 +67,7 @@ def _fraction(word: Any) -> Any:
 
 def chance(key: Any, count: Any, channel: int) -> Any:
     """A number of the uniform distribution from 0 to 1; see ``noise``."""
-    return _fraction(_mixed(_word(key, count, channel) + _STEP))
+    return _fraction(splitmix64(_word(key, count, channel) + _STEP))
 
 
 def noise(key: Any, count: Any, channel: int) -> Any:
@@ -72,8 +81,8 @@ def noise(key: Any, count: Any, channel: int) -> Any:
         channel: The number of the sensor.
     """
     word = _word(key, count, channel)
-    first = _fraction(_mixed(word + _STEP)) + _FRACTION  # the logarithm of 0 is not finite
-    second = _fraction(_mixed(word + _STEP + _STEP))
+    first = _fraction(splitmix64(word + _STEP)) + _FRACTION  # the logarithm of 0 is not finite
+    second = _fraction(splitmix64(word + _STEP + _STEP))
     return np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
 
 

@@ -41,6 +41,7 @@ __all__ = [
     "known_program",
     "obstacle_to_wine",
     "sources",
+    "sources_digest",
     "windows_path",
     "windows_uri",
     "wine_folder",
@@ -103,8 +104,8 @@ def _top() -> str:
 
 
 @functools.cache
-def _digest() -> str:
-    """Stands for the sources and the options."""
+def sources_digest() -> str:
+    """Digest of the sources and the options of the compiler."""
     digest = hashlib.sha256(repr(_OPTIONS).encode())
     for path in sources():
         digest.update(f"{path.relative_to(_top()).as_posix()}\0".encode())
@@ -128,7 +129,9 @@ def is_buildable() -> bool:
 def known_program() -> Path | None:
     """Find a program that was built before; without a compiler, any version counts."""
     with contextlib.suppress(FMULoadError):
-        found = sorted(wine_folder().glob(f"worker-{_digest()}-{_compiler_version() or '*'}.exe"))
+        found = sorted(
+            wine_folder().glob(f"worker-{sources_digest()}-{_compiler_version() or '*'}.exe")
+        )
         return found[-1] if found else None
     return None
 
@@ -150,7 +153,7 @@ def _build() -> Path:
     if not is_buildable():
         what = "ziglang, which builds" if sources() else "the C sources of"
         raise FMULoadError(f"{what} the worker program for Windows libraries, is not installed")
-    target = wine_folder() / f"worker-{_digest()}-{_compiler_version()}.exe"
+    target = wine_folder() / f"worker-{sources_digest()}-{_compiler_version()}.exe"
     logger.warning("building the worker program for Windows libraries, once; it takes some minutes")
     sweep(target.parent)
     with tempfile.TemporaryDirectory(prefix=own_prefix(), dir=target.parent) as folder:

@@ -33,7 +33,7 @@ except ImportError as error:
         lacking("fmugym.training.rllib", "RLlib", "rllib"), name=error.name
     ) from error
 
-__all__ = ["RunnerVectorEnv", "register_task"]
+__all__ = ["RunnerVectorEnv", "assigned_processors", "register_task"]
 
 logger = logging.getLogger(__name__)
 
@@ -168,7 +168,7 @@ class _Maker:
                 "set gym_env_vectorize_mode='vector_entry_point' in config.env_runners"
             )
             return self._single(arguments)
-        arguments.setdefault("threads", _processors())
+        arguments.setdefault("threads", assigned_processors())
         arguments = {"autoreset_mode": AutoresetMode.NEXT_STEP, **arguments}
         return RunnerVectorEnv(make_vector_env(self.env, num_envs, arguments))
 
@@ -196,7 +196,7 @@ def _is_file(value: Any) -> bool:
     return isinstance(value, str | os.PathLike) and Path(value).expanduser().is_file()
 
 
-def _processors() -> int:
+def assigned_processors() -> int:
     """Number of processors that Ray has given to this runner; 1 if Ray gives none."""
     if not ray.is_initialized():
         return 1

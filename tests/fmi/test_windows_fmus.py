@@ -158,12 +158,12 @@ class TestProgram:
             for file in files:
                 file.write_text(f"/* {file.name} */")
             monkeypatch.setattr(windows_worker, "sources", lambda files=files: files)
-            digests.add(windows_worker._digest.__wrapped__())
+            digests.add(windows_worker.sources_digest.__wrapped__())
         assert len(digests) == 1
 
     def test_without_a_compiler_one_that_was_built_before_is_used(self, bare, tmp_path):
         assert windows_worker.known_program() is None
-        built = windows_worker.wine_folder() / f"worker-{windows_worker._digest()}-0.0.0.exe"
+        built = windows_worker.wine_folder() / f"worker-{windows_worker.sources_digest()}-0.0.0.exe"
         built.touch()
         assert windows_worker.known_program() == built
 

@@ -102,11 +102,24 @@ class TestArrays:
         np.testing.assert_array_equal(with_these.step(actions)[0], expected)
 
 
-@pytest.fixture(name="pool")
-def fixture_pool():
-    """Two cart-poles after a step, whose inputs are recorded."""
+@pytest.fixture
+def recorded():
+    """The FMU of a cart-pole, and the settings of a pool that records its inputs."""
     fmu = FMU(bundled_fmu("CartPole"))
-    spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
+    return fmu, PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
+
+
+@pytest.fixture
+def read(recorded):
+    """The function that reads the inputs of a state."""
+    fmu, spec = recorded
+    return lambda state: inputs_in(fmu.description, spec, state)
+
+
+@pytest.fixture(name="pool")
+def fixture_pool(recorded):
+    """Two cart-poles after a step, whose inputs are recorded."""
+    fmu, spec = recorded
     pool = NativePool(fmu, spec, 2, LOG)
     pool.reset((fmu.variable("x_0"),), np.full((1, 2), 0.25))
     pool.step(np.ones((1, 2)))
@@ -115,22 +128,21 @@ def fixture_pool():
 
 
 class TestRecords:
-    def test_are_given_to_another_instance(self, pool):
+    def test_are_given_to_another_instance(self, pool, read):
         for step in range(40):
             pool.step(np.array([[0.0, step]]), np.array([True, False]))
         (state,) = pool.save_states(np.array([1]), True)
         pool.restore_states([state], np.array([0]), np.array([0]))
         pool.step(np.full((1, 2), 9.0))
-        found = [inputs_in(*pool._form, one) for one in pool.save_states(np.arange(2), True)]
+        found = list(map(read, pool.save_states(np.arange(2), True)))
         for record in found:
             assert [variable.name for variable in record.variables] == ["x_0"]
             assert record.starts.tolist() == [0.25]
             assert record.inputs[:, 0].tolist() == [1.0, *range(40), 9.0]
 
-    def test_are_each_of_their_own_episode(self, pool):
+    def test_are_each_of_their_own_episode(self, recorded, read):
         """However the steps of neighbours are shifted against each other."""
-        n, rng, fmu = 300, np.random.default_rng(0), FMU(bundled_fmu("CartPole"))
-        spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
+        n, rng, (fmu, spec) = 300, np.random.default_rng(0), recorded
         many = NativePool(fmu, spec, n, LOG, threads=2)
         starting, given = np.ones(n, np.bool_), [[] for _ in range(n)]
         for step in range(100):
@@ -143,10 +155,10 @@ class TestRecords:
             starting = rng.random(n) < 0.005
         assert max(map(len, given)) > 64 > min(map(len, given))
         for own, state in zip(given, many.save_states(np.arange(n), True), strict=True):
-            assert inputs_in(*many._form, state).inputs[:, 0].tolist() == own
+            assert read(state).inputs[:, 0].tolist() == own
         many.close()
 
-    def test_that_are_damaged_are_none(self, pool):
+    def test_that_are_damaged_are_none(self, pool, read):
         """In every byte: it is another record then, or none."""
         (state,) = pool.save_states(np.zeros(1, np.int64), True)
         told = 0
@@ -154,7 +166,7 @@ class TestRecords:
             damaged = bytearray(state)
             damaged[place] ^= 0xFF
             try:
-                inputs_in(*pool._form, bytes(damaged))
+                read(bytes(damaged))
             except SimulationError as error:
                 told += "damaged" in str(error)
         assert told > 16

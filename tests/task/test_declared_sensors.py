@@ -42,9 +42,9 @@ def episode(env, seed=None, steps=20):
 
 def test_the_bits_of_noise_are_those_of_splitmix64():
     """The reference is Vigna's program of 2015 with the seed 1234567."""
-    seeds = np.int64(1234567) + np.arange(1, 4) * functions._STEP
+    states = 1234567 + np.arange(1, 4) * np.int64(0x9E3779B97F4A7C15 - 2**64)
     expected = [6457827717110365317, 3203168211198807973, 9817491932198370423]
-    assert functions._mixed(seeds).view(np.uint64).tolist() == expected
+    assert functions.splitmix64(states).view(np.uint64).tolist() == expected
 
 
 def test_noise_is_normal_and_differs_in_steps_and_episodes(load):

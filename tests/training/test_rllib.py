@@ -192,10 +192,10 @@ def test_ppo_trains(ray_here, env_id):
 def test_a_remote_runner_has_as_many_threads_as_processors(ray_here):
     @ray.remote(num_cpus=2)
     def processors():
-        return fmugym.training.rllib._processors()
+        return fmugym.training.rllib.assigned_processors()
 
     assert ray.get(processors.remote()) == 2
-    assert fmugym.training.rllib._processors() == 1
+    assert fmugym.training.rllib.assigned_processors() == 1
 
 
 def nodes_of(group):
