@@ -346,8 +346,8 @@ MUTATIONS: Final = (
     Mutation(
         "expressions",
         "expressions/functions.py",
-        "return _mixed(episode + count.cast(np.int64) * _STEP + np.int64(channel))",
-        "return _mixed(episode + count.cast(np.int64) * _STEP)",
+        "return splitmix64(episode + count.cast(np.int64) * _STEP + np.int64(channel))",
+        "return splitmix64(episode + count.cast(np.int64) * _STEP)",
         "all sensors have the same noise",
     ),
     Mutation(
