@@ -166,6 +166,7 @@ class Episodes(ABC):
         any_ended: Whether the last step ended any episode.
         started: Whether there ever was one.
         is_ready: Whether a step may follow.
+        is_open: Whether the environments are open.
         everywhere: The indices of all environments.
     """
 
@@ -173,7 +174,19 @@ class Episodes(ABC):
         self.prototype, self.pool = prototype, pool
         self.ended, self.any_ended = np.zeros(pool.num_instances, np.bool_), False
         self.started = self.is_ready = False
+        self.is_open = True
         self.everywhere = np.arange(pool.num_instances)
+
+    def let_step(self) -> None:
+        """Let steps follow, unless another thread closes the environments meanwhile."""
+        self.started = self.is_ready = True
+        if not self.is_open:
+            self.is_ready = False
+
+    def forbid_steps(self) -> None:
+        """Let no step follow from now on, because the environments close."""
+        self.is_open = False
+        self.is_ready = False
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""

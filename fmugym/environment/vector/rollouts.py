@@ -384,7 +384,7 @@ def returning_to(episodes: Episodes, present: Snapshot | None) -> Iterator[None]
         episodes.is_ready = False
         if present is not None:
             episodes.go_on_from(present, episodes.everywhere)
-            episodes.is_ready = True
+            episodes.let_step()
 
 
 def roll_out(task: VectorTask, start: Snapshot, candidates: Candidates) -> Rollout:

@@ -220,7 +220,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         except BaseException:
             self._interrupt()
             raise
-        self.episodes.started = self.episodes.is_ready = True
+        self.episodes.let_step()
         return observations, infos
 
     def step(self, actions: Any) -> StepResult:
@@ -408,7 +408,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self.episodes.is_ready = False
         self.episodes.restore(snapshot.bundle, sources, indices)
         self.episodes.place(columns, sources, indices)
-        self.episodes.started = self.episodes.is_ready = True
+        self.episodes.let_step()
         return self.task.observe(indices)
 
     def rollout(
@@ -535,7 +535,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """Free the pool, after waiting for a step that is under way."""
         if "task" in vars(self):  # otherwise the constructor has closed everything
             self._background.stop()
-            self.episodes.is_ready = False
+            self.episodes.forbid_steps()
             try:
                 self.episodes.close()
             finally:

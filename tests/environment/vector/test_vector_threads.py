@@ -68,6 +68,22 @@ def test_a_thread_may_close_it_meanwhile(options):
             envs.step(ACTIONS)
 
 
+@pytest.mark.parametrize("options", OPTIONS)
+def test_a_thread_may_close_it_at_the_end_of_a_reset(options, monkeypatch):
+    envs = many(CartPoleEnv, 3, **options)
+    reset = envs.task.reset
+
+    def closed_meanwhile(*args):
+        result = reset(*args)
+        run_together([envs.close])
+        return result
+
+    monkeypatch.setattr(envs.task, "reset", closed_meanwhile)
+    envs.reset(seed=0)
+    with pytest.raises(SimulationError, match="step was called on a closed FMUVectorEnv"):
+        envs.step(ACTIONS)
+
+
 def require_whole(envs):
     """It plays as a new one does, also in another thread."""
     played = []
