@@ -1,6 +1,7 @@
 """The layers of the package: imports run one way, and no two modules import each other."""
 
 import ast
+import graphlib
 import re
 from collections import Counter
 from functools import cache
@@ -138,6 +139,18 @@ def test_a_c_file_includes_files_of_its_folder_and_of_those_below():
             above = [name for name in included if name.split("/")[0] not in folders[place:]]
             upwards += [f"{path.name}: {name}" for name in above]
     assert upwards == []
+
+
+def test_c_files_include_each_other_in_no_circle():
+    """A source and its header count as one; fmu.c joins all others."""
+    for folder in ("resources/src", "native"):
+        needs = {}
+        for path in (ROOT / folder).rglob("*.[ch]"):
+            found = re.findall(r'#include "(?:\w+/)?(\w+)\.h"', path.read_text(encoding="utf-8"))
+            needs.setdefault(path.stem, set()).update(set(found) - {path.stem, "fmu"})
+        needs.pop("fmu", None)
+        assert len(needs) > 5
+        graphlib.TopologicalSorter(needs).prepare()  # raises CycleError
 
 
 def test_no_module_imports_itself_by_a_detour():

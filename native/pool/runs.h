@@ -1,17 +1,9 @@
-/* Runs: neighbouring instances whose inputs and outputs are moved together, in loops that become
- * vector instructions. */
+/* Work on runs of instances. */
 
 #ifndef FMUGYM_RUNS_H
 #define FMUGYM_RUNS_H
 
 #include "pool/task.h"
-#include "program/program.h"
-
-enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
-
-static inline size_t length_of_run(size_t first, size_t end) {
-    return end - first < RUN ? end - first : RUN;
-}
 
 /* All three work on the items from begin to end and return how many instances have a status
  * worse than a warning. This one resets or restores instances that need not be neighbours: */

@@ -6,7 +6,6 @@
 #include <string.h>
 
 #include "pool/initial_states.h"
-#include "pool/runs.h"
 
 static float *observation_of(const Task *task, size_t index) {
     return task->call->observations + index * task->pool->settings.num_observed;

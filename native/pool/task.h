@@ -5,6 +5,15 @@
 
 #include "pool/states.h"
 #include "pool/steps.h"
+#include "program/program.h"
+
+/* Runs: neighbouring instances whose inputs and outputs are moved together, in loops that become
+ * vector instructions. */
+enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
+
+static inline size_t length_of_run(size_t first, size_t end) {
+    return end - first < RUN ? end - first : RUN;
+}
 
 /* What a call does; all threads that work on it write to its last fields. */
 typedef struct {
