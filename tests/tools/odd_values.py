@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 from fmugym import FMUGymError
 
-LONG = 2000
-"""More characters than the text of an error may have."""
+LONG = 5000
+"""More characters than the text of an error may have, which tells of up to twenty mistakes."""
 
 
 @contextlib.contextmanager
