@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.spaces.graph import GraphInstance
 
 from fmugym.environment.spaces import to_input_types
 from fmugym.errors import ConfigError, FMUGymError, shown
@@ -185,7 +186,9 @@ def _kept(action: Any) -> Any:
         return action.copy()
     if type(action) is dict:
         return {name: _kept(part) for name, part in action.items()}
-    return type(action)(map(_kept, action)) if type(action) in (list, tuple) else action
+    if type(action) in (list, tuple):
+        return type(action)(map(_kept, action))
+    return action._make(map(_kept, action)) if isinstance(action, GraphInstance) else action
 
 
 def take_action(env: Any, action: Any) -> tuple[Any, ...]:

@@ -231,10 +231,10 @@ MUTATIONS: Final = (
     ),
     Mutation(
         "environment",
-        "environment/vector/hook_tasks.py",
-        "iterate(self._action_space, copy.deepcopy(actions))",
-        "iterate(self._action_space, actions)",
-        "who uses actions in parts again changes the action before, which hooks read",
+        "environment/actions.py",
+        "    if isinstance(action, np.ndarray):\n        return action.copy()\n",
+        "",
+        "who uses the array of an action again changes the action before, which hooks read",
     ),
     Mutation(
         "environment",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -342,12 +341,12 @@ class EachHooks(VectorTask):
             raise
 
     def _actions(self, actions: Any) -> Sequence[Any]:
-        """Copy the action of each environment, because hooks keep it."""
+        """The action of each environment."""
         space = self.episodes.envs[0].action_space
         if self._checks_all:
             return cast(Sequence[Any], checked_actions(space, len(self.episodes.envs), actions))
         try:
-            items = list(iterate(self._action_space, copy.deepcopy(actions)))
+            items = list(iterate(self._action_space, actions))
         except Exception:  # users' actions may raise anything
             raise ConfigError(
                 f"the actions do not make one of {space} for each environment: {shown(actions)}"

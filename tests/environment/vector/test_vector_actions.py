@@ -18,6 +18,7 @@ from vector_tools import (
 )
 from ways import ALL_WAYS, in_way, make_vec
 
+import fmugym
 from fmugym import ConfigError
 
 
@@ -121,3 +122,33 @@ def test_inputs_outside_of_their_type(probe, make_envs):
     envs.reset(seed=0)
     with pytest.raises(ConfigError, match="expected an integer from"):
         envs.step(np.array([1, 5]))
+
+
+class OfNodes(fmugym.FMI2CSEnv):
+    """An environment whose actions are graphs: the first node is the force."""
+
+    def __init__(self):
+        config = {"model_input_names": "f", "model_output_names": "x", "time_step": 0.05}
+        super().__init__(fmugym.bundled_fmu("CartPole"), config)
+
+    def _get_action_space(self):
+        return gym.spaces.Graph(gym.spaces.Box(-1.0, 1.0, (1,)), None)
+
+    def _get_inputs(self):
+        return [float(self.action.nodes[0, 0])]
+
+    def _is_done(self):
+        return False
+
+
+def test_who_uses_the_nodes_of_a_graph_again_leaves_the_latest_action_as_it_was():
+    single, vector = OfNodes(), fmugym.FMUVectorEnv(OfNodes, 2)
+    graph = single.action_space.sample(num_nodes=2)
+    for env, action in ((single, graph), (vector, (graph, graph))):
+        graph.nodes[:] = 0.5
+        env.reset(seed=0)
+        env.step(action)
+        graph.nodes[:] = -0.5
+        latest = [env.action] if env is single else env.get_attr("action")
+        assert all(np.array_equal(one.nodes, np.full_like(graph.nodes, 0.5)) for one in latest)
+        env.close()
