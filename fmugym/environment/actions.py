@@ -188,7 +188,7 @@ def _kept(action: Any) -> Any:
         return {name: _kept(part) for name, part in action.items()}
     if type(action) in (list, tuple):
         return type(action)(map(_kept, action))
-    return action._make(map(_kept, action)) if isinstance(action, GraphInstance) else action
+    return GraphInstance(*map(_kept, action)) if isinstance(action, GraphInstance) else action
 
 
 def take_action(env: Any, action: Any) -> tuple[Any, ...]:
