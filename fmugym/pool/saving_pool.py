@@ -196,7 +196,7 @@ class SavingPool(RetryingPool):
         """See ``Pool.restore_instances``."""
         if bundle.replays:
             there = self._restore_copies(bundle, sources, indices)
-            there |= ~np.array([head.is_record for head in bundle.heads])[sources]
+            there |= ~np.array([head.is_record for head in bundle.heads], np.bool_)[sources]
             self._replay(bundle.states_at(sources[~there]), indices[~there])
             sources, indices = sources[there], indices[there]
         elif self.save_method is not SaveMethod.STATE:

@@ -180,7 +180,7 @@ class Episodes(ABC):
     def let_step(self) -> None:
         """Let steps follow, unless another thread closes the environments meanwhile."""
         self.started = self.is_ready = True
-        if not self.is_open:
+        if not self.is_open:  # asked afterwards, so that no close comes in between
             self.is_ready = False
 
     def forbid_steps(self) -> None:
